@@ -1,0 +1,683 @@
+"""Expressions over features: the one language in which every part of a model is written.
+
+An expression is a finite tree, immutable and compared by structure:
+
+    e ::= c                          a constant: a rational, a truth value or the name of a value
+        | x | x' | o                 a feature now, the same feature next, an observation feature
+        | p                          a named parameter of the model
+        | op(e_1, ..., e_n)          an operator of `OPERATORS`
+        | if e_0 then e_1 else e_2   only the chosen branch counts
+        | switch x {v: e_v, ..., e}  a decision-tree node; `e` for the values not listed
+        | {e_1: q_1, ..., e_n: q_n}  a *lottery*: value e_i with probability q_i (equal values add up)
+
+A conditional distribution is an expression whose chosen branch is a lottery, or a plain value
+(probability 1).  Evaluation is partial: `1/x` at x = 0, or `x + 1` where x + 1 is no value of the
+feature it is assigned to, is `Undefined` with a reason; an undefined part in a branch that is not
+taken, or behind a deciding `and`/`or`, is harmless.  All numbers are rationals.
+"""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any, Final, Union
+
+Value = Union[bool, int, str]
+"""A value of a feature."""
+
+Scalar = Union[Fraction, bool, str]
+"""A value of an expression: integers are rationals here."""
+
+MAXIMUM_BITS: Final = 20_000
+"""Largest numerator or denominator, in bits, that arithmetic on constants may produce."""
+
+MAXIMUM_EXPONENT: Final = 1_000
+"""Largest absolute value of an exponent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Undefined:
+    """The result of an expression that has no value, and why."""
+
+    reason: str
+
+
+def scalar(value: Value) -> Scalar:
+    """The expression value that stands for feature value `value`."""
+    if isinstance(value, (bool, str)):
+        return value
+    return Fraction(value)
+
+
+def same(a: Scalar, b: Scalar) -> bool:
+    """Whether two values of one kind are equal (`True` is not the number 1)."""
+    return type(a) is type(b) and a == b
+
+
+def describe(value: Scalar | Undefined) -> str:
+    """`value` as a person would write it."""
+    if isinstance(value, Undefined):
+        return f"undefined ({value.reason})"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return str(value)
+
+
+# --------------------------------------------------------------------------------------------
+# Operators
+# --------------------------------------------------------------------------------------------
+
+
+def _number(value: Fraction) -> Fraction | Undefined:
+    if max(value.numerator.bit_length(), value.denominator.bit_length()) > MAXIMUM_BITS:
+        return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
+    return value
+
+
+def _add(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    return _number(a + b)
+
+
+def _multiply(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    return _number(a * b)
+
+
+def _divide(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    if b == 0:
+        return Undefined("division by zero")
+    return _number(a / b)
+
+
+def _floor_divide(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    if b == 0:
+        return Undefined("division by zero")
+    return Fraction(a // b)
+
+
+def _modulo(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    if b == 0:
+        return Undefined("division by zero")
+    return _number(a % b)
+
+
+def _power(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    if b.denominator != 1 or abs(b.numerator) > MAXIMUM_EXPONENT:
+        return Undefined(f"an exponent must be an integer of at most {MAXIMUM_EXPONENT}")
+    if a == 0 and b < 0:
+        return Undefined("division by zero")
+    bits = max(a.numerator.bit_length(), a.denominator.bit_length())
+    if bits * abs(b.numerator) > MAXIMUM_BITS:
+        return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
+    return Fraction(a ** int(b))
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """A row of the operator table.
+
+    `kind` says what the arguments are: "number", "order" (numbers, gives a truth value),
+    "equality" (two values of one kind, gives a truth value) or "logic".
+    `associative` operators take any number of arguments from two on.
+    """
+
+    name: str
+    symbol: str
+    kind: str
+    arity: int
+    associative: bool = False
+    function: Callable[..., Any] | None = None
+
+
+OPERATORS: Final[Mapping[str, Operator]] = {
+    row.name: row
+    for row in (
+        Operator("add", "+", "number", 2, True, _add),
+        Operator("multiply", "*", "number", 2, True, _multiply),
+        Operator("divide", "/", "number", 2, False, _divide),
+        Operator("floor_divide", "//", "number", 2, False, _floor_divide),
+        Operator("modulo", "%", "number", 2, False, _modulo),
+        Operator("power", "**", "number", 2, False, _power),
+        Operator("negate", "-", "number", 1, False, lambda a: -a),
+        Operator("absolute", "abs", "number", 1, False, abs),
+        Operator("minimum", "min", "number", 2, True, min),
+        Operator("maximum", "max", "number", 2, True, max),
+        Operator("equal", "==", "equality", 2, False, lambda a, b: a == b),
+        Operator("not_equal", "!=", "equality", 2, False, lambda a, b: a != b),
+        Operator("less", "<", "order", 2, False, lambda a, b: a < b),
+        Operator("less_equal", "<=", "order", 2, False, lambda a, b: a <= b),
+        Operator("greater", ">", "order", 2, False, lambda a, b: a > b),
+        Operator("greater_equal", ">=", "order", 2, False, lambda a, b: a >= b),
+        Operator("and", "and", "logic", 2, True),
+        Operator("or", "or", "logic", 2, True),
+        Operator("not", "not", "logic", 1),
+    )
+}
+
+
+def _kind(value: Scalar) -> str:
+    if isinstance(value, bool):
+        return "a truth value"
+    return "a number" if isinstance(value, Fraction) else "a name"
+
+
+def _logic(name: str, values: Iterable[Scalar | Undefined]) -> bool | Undefined:
+    decides = name == "or"
+    for value in values:
+        if isinstance(value, Undefined):
+            return value
+        if not isinstance(value, bool):
+            return Undefined(f"'{name}' needs truth values, not {_kind(value)} ({value})")
+        if name == "not":
+            return not value
+        if value is decides:
+            return decides
+    return not decides
+
+
+def apply_operator(name: str, values: Iterable[Scalar | Undefined]) -> Scalar | Undefined:
+    """The value of operator `name` on `values`; `Undefined` where it has none.
+
+    `and` and `or` read from left to right and stop at the first value that decides.
+    """
+    row = OPERATORS[name]
+    if row.kind == "logic":
+        return _logic(name, values)
+    arguments: list[Scalar] = []
+    for value in values:
+        if isinstance(value, Undefined):
+            return value
+        arguments.append(value)
+    if row.kind == "equality":
+        a, b = arguments
+        if type(a) is not type(b):
+            return Undefined(f"'{row.symbol}' compares {_kind(a)} ({a}) with {_kind(b)} ({b})")
+    else:
+        for value in arguments:
+            if not isinstance(value, Fraction):
+                return Undefined(f"'{row.symbol}' needs numbers, not {_kind(value)} ({value})")
+    function = row.function
+    assert function is not None
+    result: Scalar | Undefined
+    if not row.associative:
+        result = function(*arguments)
+    else:
+        result = arguments[0]
+        for value in arguments[1:]:
+            result = function(result, value)
+            if isinstance(result, Undefined):
+                return result
+    return result
+
+
+# --------------------------------------------------------------------------------------------
+# Nodes
+# --------------------------------------------------------------------------------------------
+
+
+class Operators:
+    """Python operators that build expressions; `==` stays equality of structure, see `is_`."""
+
+    __slots__ = ()
+
+    def __add__(self, other: ExpressionLike) -> Expression:
+        return operation("add", self, other)
+
+    def __radd__(self, other: ExpressionLike) -> Expression:
+        return operation("add", other, self)
+
+    def __sub__(self, other: ExpressionLike) -> Expression:
+        return operation("add", self, operation("negate", other))
+
+    def __rsub__(self, other: ExpressionLike) -> Expression:
+        return operation("add", other, operation("negate", self))
+
+    def __mul__(self, other: ExpressionLike) -> Expression:
+        return operation("multiply", self, other)
+
+    def __rmul__(self, other: ExpressionLike) -> Expression:
+        return operation("multiply", other, self)
+
+    def __truediv__(self, other: ExpressionLike) -> Expression:
+        return operation("divide", self, other)
+
+    def __rtruediv__(self, other: ExpressionLike) -> Expression:
+        return operation("divide", other, self)
+
+    def __floordiv__(self, other: ExpressionLike) -> Expression:
+        return operation("floor_divide", self, other)
+
+    def __mod__(self, other: ExpressionLike) -> Expression:
+        return operation("modulo", self, other)
+
+    def __pow__(self, other: ExpressionLike) -> Expression:
+        return operation("power", self, other)
+
+    def __neg__(self) -> Expression:
+        return operation("negate", self)
+
+    def __abs__(self) -> Expression:
+        return operation("absolute", self)
+
+    def __lt__(self, other: ExpressionLike) -> Expression:
+        return operation("less", self, other)
+
+    def __le__(self, other: ExpressionLike) -> Expression:
+        return operation("less_equal", self, other)
+
+    def __gt__(self, other: ExpressionLike) -> Expression:
+        return operation("greater", self, other)
+
+    def __ge__(self, other: ExpressionLike) -> Expression:
+        return operation("greater_equal", self, other)
+
+    def __and__(self, other: ExpressionLike) -> Expression:
+        return operation("and", self, other)
+
+    def __rand__(self, other: ExpressionLike) -> Expression:
+        return operation("and", other, self)
+
+    def __or__(self, other: ExpressionLike) -> Expression:
+        return operation("or", self, other)
+
+    def __ror__(self, other: ExpressionLike) -> Expression:
+        return operation("or", other, self)
+
+    def __invert__(self) -> Expression:
+        return operation("not", self)
+
+    def is_(self, other: Expression | Value) -> Expression:
+        """The condition that this equals `other`; a `str` is a value's name, not a text to parse."""
+        constant = Constant(other) if isinstance(other, str) else other
+        return operation("equal", self, constant)
+
+    def is_in(self, values: Iterable[Value]) -> Expression:
+        """The condition that this equals one of `values`."""
+        tests = [self.is_(value) for value in values]
+        return tests[0] if len(tests) == 1 else disjunction(tests)
+
+    def _sympy_(self) -> Any:
+        from factored_polca.models.symbols import to_sympy
+
+        return to_sympy(as_expression(self))
+
+
+class Expression(Operators):
+    """Base of the seven node classes below, which are final."""
+
+    __slots__ = ("_hash",)
+    _hash: int
+
+    def _key(self) -> tuple[object, ...]:
+        raise AssertionError("every node class defines its key")
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if type(self) is not type(other):
+            return False
+        assert isinstance(other, Expression)
+        return self._hash == other._hash and self._key() == other._key()
+
+    def _seal(self) -> None:
+        object.__setattr__(self, "_hash", hash((type(self).__name__, self._key())))
+
+    def __str__(self) -> str:
+        from factored_polca.models.language import to_text
+
+        return to_text(self)
+
+    def __bool__(self) -> bool:
+        raise TypeError(
+            "an expression has no truth value in Python: combine conditions with & | ~ and "
+            "write one comparison at a time"
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Constant(Expression):
+    """A rational, a truth value or the name of a value."""
+
+    value: Scalar
+
+    def __post_init__(self) -> None:
+        if isinstance(self.value, int) and not isinstance(self.value, bool):
+            object.__setattr__(self, "value", Fraction(self.value))
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (type(self.value), self.value)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Reference(Expression):
+    """A feature now, a feature next (`primed`) or an observation feature."""
+
+    name: str
+    primed: bool = False
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.name, self.primed)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Parameter(Expression):
+    """A named number of the model."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.name,)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Operation(Expression):
+    """Operator `operator` of `OPERATORS` on `arguments`; build it with `operation`."""
+
+    operator: str
+    arguments: tuple[Expression, ...]
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.operator, self.arguments)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Conditional(Expression):
+    """`then` where `condition` holds, `otherwise` elsewhere."""
+
+    condition: Expression
+    then: Expression
+    otherwise: Expression
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.condition, self.then, self.otherwise)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Switch(Expression):
+    """A decision-tree node: the case of the reference's value, or `otherwise`."""
+
+    reference: Reference
+    cases: tuple[tuple[Value, Expression], ...]
+    otherwise: Expression | None = None
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        typed = tuple((type(value), value, case) for value, case in self.cases)
+        return (self.reference, typed, self.otherwise)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lottery(Expression):
+    """A distribution: pairs (value, probability)."""
+
+    outcomes: tuple[tuple[Expression, Expression], ...]
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _key(self) -> tuple[object, ...]:
+        return (self.outcomes,)
+
+
+ExpressionLike = Any
+"""What `as_expression` takes: an expression, a feature, a number, a truth value, a text, or sympy."""
+
+TRUE: Final = Constant(True)
+FALSE: Final = Constant(False)
+ZERO: Final = Constant(Fraction(0))
+ONE: Final = Constant(Fraction(1))
+
+
+def as_expression(thing: ExpressionLike) -> Expression:
+    """`thing` as an expression.
+
+    A `str` is read in the expression language; a `float` means its shortest decimal (0.1 is 1/10).
+
+    Raises:
+        TypeError: `thing` is none of these.
+        ModelError: a text that is no expression.
+    """
+    if isinstance(thing, Expression):
+        return thing
+    if isinstance(thing, bool):
+        return Constant(thing)
+    if isinstance(thing, numbers.Rational):
+        return Constant(Fraction(int(thing.numerator), int(thing.denominator)))
+    if isinstance(thing, float):
+        if thing != thing or thing in (float("inf"), float("-inf")):
+            raise TypeError(f"{thing} is not a rational number")
+        return Constant(Fraction(repr(thing)))
+    if isinstance(thing, Decimal):
+        return Constant(Fraction(thing))
+    if isinstance(thing, str):
+        from factored_polca.models.language import parse
+
+        return parse(thing)
+    if isinstance(thing, Operators):
+        return Reference(thing.name)  # type: ignore[attr-defined]
+    if type(thing).__module__.partition(".")[0] == "sympy":
+        from factored_polca.models.symbols import from_sympy
+
+        return from_sympy(thing)
+    if isinstance(thing, Mapping):
+        return lottery(thing)
+    raise TypeError(
+        f"{thing!r} is no expression: give an expression, a feature, a number, a truth value, "
+        "a text in the expression language, a mapping {value: probability} or a sympy expression"
+    )
+
+
+def operation(name: str, *arguments: ExpressionLike) -> Expression:
+    """Operator `name` on `arguments`: nested associative operators are flattened, constants folded."""
+    row = OPERATORS[name]
+    parts = [as_expression(argument) for argument in arguments]
+    if row.associative:
+        flat: list[Expression] = []
+        for part in parts:
+            if isinstance(part, Operation) and part.operator == name:
+                flat.extend(part.arguments)
+            else:
+                flat.append(part)
+        parts = _fold_start(name, flat)
+        if len(parts) == 1:
+            return parts[0]
+    constants = [part.value for part in parts if isinstance(part, Constant)]
+    if len(constants) == len(parts):
+        result = apply_operator(name, constants)
+        if not isinstance(result, Undefined):
+            return Constant(result)
+    return Operation(name, tuple(parts))
+
+
+def _fold_start(name: str, parts: list[Expression]) -> list[Expression]:
+    """`parts` with the constants at its start combined, as reading from left to right does."""
+    first, rest = parts[0], 1
+    while rest < len(parts):
+        second = parts[rest]
+        if not (isinstance(first, Constant) and isinstance(second, Constant)):
+            break
+        result = apply_operator(name, (first.value, second.value))
+        if isinstance(result, Undefined):
+            break
+        first, rest = Constant(result), rest + 1
+    return [first, *parts[rest:]]
+
+
+def conjunction(conditions: Iterable[ExpressionLike]) -> Expression:
+    """All of `conditions`; true if there are none."""
+    parts = list(conditions)
+    return operation("and", *parts) if parts else TRUE
+
+
+def disjunction(conditions: Iterable[ExpressionLike]) -> Expression:
+    """At least one of `conditions`; false if there are none."""
+    parts = list(conditions)
+    return operation("or", *parts) if parts else FALSE
+
+
+def conditional(condition: ExpressionLike, then: ExpressionLike, otherwise: ExpressionLike) -> Expression:
+    """`then` where `condition` holds, `otherwise` elsewhere."""
+    return Conditional(as_expression(condition), as_expression(then), as_expression(otherwise))
+
+
+def named(value: ExpressionLike) -> Expression:
+    """A feature value or an expression; here a `str` is the name of a value."""
+    return Constant(value) if isinstance(value, str) else as_expression(value)
+
+
+def lottery(outcomes: Mapping[Any, ExpressionLike] | Iterable[tuple[Any, ExpressionLike]]) -> Lottery:
+    """The distribution with the given (value, probability) pairs; a `str` key names a value."""
+    pairs = outcomes.items() if isinstance(outcomes, Mapping) else outcomes
+    return Lottery(tuple((named(value), as_expression(chance)) for value, chance in pairs))
+
+
+def children(expression: Expression) -> tuple[Expression, ...]:
+    """The direct parts of `expression`."""
+    match expression:
+        case Operation():
+            return expression.arguments
+        case Conditional():
+            return (expression.condition, expression.then, expression.otherwise)
+        case Switch():
+            parts = tuple(case for _, case in expression.cases)
+            tail = () if expression.otherwise is None else (expression.otherwise,)
+            return (expression.reference, *parts, *tail)
+        case Lottery():
+            return tuple(part for pair in expression.outcomes for part in pair)
+    return ()
+
+
+def subexpressions(*roots: Expression) -> Iterator[Expression]:
+    """Every distinct part of `roots`, each once, parts after the whole."""
+    seen: set[Expression] = set()
+    stack = list(reversed(roots))
+    while stack:
+        expression = stack.pop()
+        if expression in seen:
+            continue
+        seen.add(expression)
+        yield expression
+        stack.extend(reversed(children(expression)))
+
+
+def references(*roots: Expression) -> set[Reference]:
+    """The references in `roots`."""
+    return {part for part in subexpressions(*roots) if isinstance(part, Reference)}
+
+
+def rewrite(expression: Expression, leaf: Callable[[Expression], Expression]) -> Expression:
+    """`expression` with `leaf` applied to each reference, parameter and constant."""
+    memo: dict[Expression, Expression] = {}
+
+    def visit(e: Expression) -> Expression:
+        if e in memo:
+            return memo[e]
+        result: Expression
+        match e:
+            case Operation():
+                result = operation(e.operator, *(visit(a) for a in e.arguments))
+            case Conditional():
+                result = Conditional(visit(e.condition), visit(e.then), visit(e.otherwise))
+            case Switch():
+                reference = visit(e.reference)
+                assert isinstance(reference, Reference), "a switch is over a feature"
+                otherwise = None if e.otherwise is None else visit(e.otherwise)
+                cases = tuple((value, visit(case)) for value, case in e.cases)
+                result = Switch(reference, cases, otherwise)
+            case Lottery():
+                result = Lottery(tuple((visit(v), visit(q)) for v, q in e.outcomes))
+            case _:
+                result = leaf(e)
+        memo[e] = result
+        return result
+
+    return visit(expression)
+
+
+def depth(expression: Expression) -> int:
+    """Length of the longest path from `expression` to a leaf; computed without recursion."""
+    deepest: dict[Expression, int] = {}
+    for part in _postorder(expression):
+        deepest[part] = 1 + max((deepest[child] for child in children(part)), default=0)
+    return deepest[expression]
+
+
+def _postorder(root: Expression) -> list[Expression]:
+    """Parts of `root`, each once, every part before its whole."""
+    state: dict[Expression, bool] = {}
+    order: list[Expression] = []
+    stack: list[tuple[Expression, bool]] = [(root, False)]
+    while stack:
+        part, done = stack.pop()
+        if done:
+            order.append(part)
+            continue
+        if part in state:
+            continue
+        state[part] = True
+        stack.append((part, True))
+        stack.extend((child, False) for child in children(part))
+    return order
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """The names an expression may use: features, observation features, parameters, named values."""
+
+    features: frozenset[str] = frozenset()
+    observations: frozenset[str] = frozenset()
+    parameters: frozenset[str] = frozenset()
+    values: frozenset[str] = frozenset()
+    allow_next: bool = True
+
+    def resolve(self, reference: Reference) -> Expression | str:
+        """What a name stands for, or the message that it stands for nothing."""
+        name = reference.name
+        if name in self.features:
+            if reference.primed and not self.allow_next:
+                return f"{name}' (the next state) can't be used here"
+            return reference
+        if reference.primed:
+            return f"{name}' : there is no feature {name!r}; {self._known()}"
+        if name in self.observations:
+            return reference
+        if name in self.parameters:
+            return Parameter(name)
+        if name in self.values:
+            return Constant(name)
+        return f"unknown name {name!r}; {self._known()}"
+
+    def _known(self) -> str:
+        groups = (
+            ("features", self.features),
+            ("observations", self.observations),
+            ("parameters", self.parameters),
+            ("values", self.values),
+        )
+        parts = []
+        for title, names in groups:
+            if names:
+                listed = sorted(names)
+                shown = ", ".join(listed[:12]) + (", ..." if len(listed) > 12 else "")
+                parts.append(f"{title}: {shown}")
+        return "known " + "; ".join(parts) if parts else "no names are known here"
