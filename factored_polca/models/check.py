@@ -29,7 +29,7 @@ from factored_polca.models.tasks import Task, TaskHierarchy
 
 MAXIMUM_FEATURES = 10_000
 MAXIMUM_VALUES = 100_000
-MAXIMUM_EXPRESSION_DEPTH = 600
+MAXIMUM_EXPRESSION_DEPTH = 300
 
 Path = tuple[str, ...]
 

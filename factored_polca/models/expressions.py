@@ -587,43 +587,39 @@ def references(*roots: Expression) -> set[Reference]:
 
 def rewrite(expression: Expression, leaf: Callable[[Expression], Expression]) -> Expression:
     """`expression` with `leaf` applied to each reference, parameter and constant."""
-    memo: dict[Expression, Expression] = {}
-
-    def visit(e: Expression) -> Expression:
-        if e in memo:
-            return memo[e]
+    new: dict[Expression, Expression] = {}
+    for e in parts_first(expression):
         result: Expression
         match e:
             case Operation():
-                result = operation(e.operator, *(visit(a) for a in e.arguments))
+                result = operation(e.operator, *(new[a] for a in e.arguments))
             case Conditional():
-                result = Conditional(visit(e.condition), visit(e.then), visit(e.otherwise))
+                result = Conditional(new[e.condition], new[e.then], new[e.otherwise])
             case Switch():
-                reference = visit(e.reference)
-                assert isinstance(reference, Reference), "a switch is over a feature"
-                otherwise = None if e.otherwise is None else visit(e.otherwise)
-                cases = tuple((value, visit(case)) for value, case in e.cases)
+                reference = new[e.reference]
+                if not isinstance(reference, Reference):
+                    reference = e.reference
+                otherwise = None if e.otherwise is None else new[e.otherwise]
+                cases = tuple((value, new[case]) for value, case in e.cases)
                 result = Switch(reference, cases, otherwise)
             case Lottery():
-                result = Lottery(tuple((visit(v), visit(q)) for v, q in e.outcomes))
+                result = Lottery(tuple((new[v], new[q]) for v, q in e.outcomes))
             case _:
                 result = leaf(e)
-        memo[e] = result
-        return result
-
-    return visit(expression)
+        new[e] = result
+    return new[expression]
 
 
 def depth(expression: Expression) -> int:
     """Length of the longest path from `expression` to a leaf; computed without recursion."""
     deepest: dict[Expression, int] = {}
-    for part in _postorder(expression):
+    for part in parts_first(expression):
         deepest[part] = 1 + max((deepest[child] for child in children(part)), default=0)
     return deepest[expression]
 
 
-def _postorder(root: Expression) -> list[Expression]:
-    """Parts of `root`, each once, every part before its whole."""
+def parts_first(root: Expression) -> list[Expression]:
+    """The parts of `root`, each once, every part before its whole; without recursion."""
     state: dict[Expression, bool] = {}
     order: list[Expression] = []
     stack: list[tuple[Expression, bool]] = [(root, False)]

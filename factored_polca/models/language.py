@@ -48,6 +48,7 @@ from factored_polca.models.expressions import (
     depth,
     disjunction,
     operation,
+    parts_first,
 )
 
 MAXIMUM_LENGTH: Final = 1_000_000
@@ -391,8 +392,8 @@ def parse(text: str, scope: Scope | None = None) -> Expression:
     """
     parser = _Parser(text, scope)
     result = parser.whole()
-    if depth(result) > 4 * MAXIMUM_DEPTH:
-        raise parser.error(f"an expression nested deeper than {4 * MAXIMUM_DEPTH} levels", 0)
+    if depth(result) > 2 * MAXIMUM_DEPTH:
+        raise parser.error(f"an expression nested deeper than {2 * MAXIMUM_DEPTH} levels", 0)
     return result
 
 
@@ -453,7 +454,7 @@ def to_text(expression: Expression) -> str:
     memo: dict[Expression, tuple[str, int]] = {}
 
     def wrap(e: Expression, least: int) -> str:
-        text, level = visit(e)
+        text, level = memo[e]
         return text if level >= least else f"({text})"
 
     def render(e: Expression) -> tuple[str, int]:
@@ -468,24 +469,23 @@ def to_text(expression: Expression) -> str:
                 test, then = wrap(e.condition, 2), wrap(e.then, 2)
                 return f"{then} if {test} else {wrap(e.otherwise, 1)}", 1
             case Switch():
-                parts = [visit(e.reference)[0]]
-                parts += [f"{value_text(value)}: {visit(case)[0]}" for value, case in e.cases]
+                parts = [memo[e.reference][0]]
+                parts += [f"{value_text(value)}: {memo[case][0]}" for value, case in e.cases]
                 if e.otherwise is not None:
-                    parts.append(f"else: {visit(e.otherwise)[0]}")
+                    parts.append(f"else: {memo[e.otherwise][0]}")
                 return f"switch({', '.join(parts)})", _ATOM
             case Lottery():
-                pairs = (f"{visit(v)[0]}: {visit(q)[0]}" for v, q in e.outcomes)
+                pairs = (f"{memo[v][0]}: {memo[q][0]}" for v, q in e.outcomes)
                 return "{" + ", ".join(pairs) + "}", _ATOM
             case Operation():
                 return _operation_text(e, wrap)
         raise TypeError(f"{type(e).__name__} is no expression")
 
-    def visit(e: Expression) -> tuple[str, int]:
-        if e not in memo:
-            memo[e] = render(e)
-        return memo[e]
-
-    return visit(expression)[0]
+    for part in parts_first(expression):
+        memo[part] = render(part)
+        if len(memo[part][0]) > MAXIMUM_LENGTH:
+            raise ModelError(f"an expression of more than {MAXIMUM_LENGTH} characters can't be written")
+    return memo[expression][0]
 
 
 def _operation_text(e: Operation, wrap: object) -> tuple[str, int]:

@@ -1,0 +1,290 @@
+"""Binary operators on two diagrams, and the choice if-then-else, as resumable kernels.
+
+The recursion on the two top nodes (Bryant 1986; Bahar et al. 1993 for several leaf values) is run
+on an explicit stack, so that it can stop for more memory or for Ctrl-C and go on where it was:
+
+    frame   a, b (and c), level, next child
+    results the finished children of all open frames
+
+An operator is a row of `OPERATORS`: its code, which leaf types it takes, identities, absorbing
+elements, whether it commutes, and what it gives on equal arguments.  Kernels know no operator but
+by these rows, except for `leaf_value`, which computes on two leaves.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
+from factored_polca.diagrams.jit import inline, int64, kernel
+from factored_polca.diagrams.nodes import (
+    DONE,
+    FULL,
+    STEPS,
+    YIELDED,
+    Int32Array,
+    Int64Array,
+    find_or_add,
+    payload,
+)
+
+(
+    FIELD_ADD, FIELD_SUBTRACT, FIELD_MULTIPLY,
+    FLOAT_ADD, FLOAT_SUBTRACT, FLOAT_MULTIPLY, FLOAT_MINIMUM, FLOAT_MAXIMUM, FLOAT_LESS,
+    AND, OR, XOR, DIFFERENCE, EQUAL, PAIR,
+) = range(1, 16)  # fmt: skip
+"""Operator codes."""
+
+CODE, LEFT_IDENTITY, RIGHT_IDENTITY, LEFT_ABSORBING, RIGHT_ABSORBING, COMMUTES, SAME, KEY = range(8)
+"""Places in the row of integers that describes an operator to the kernel: nodes, or 0 for none.
+
+`SAME`: -1 the argument itself, 0 no rule, else the node that op(a, a) gives; `KEY` marks entries of
+the computed cache (the operator's code and the field)."""
+
+_S32 = np.uint64(32)
+_LOW = np.uint64(0xFFFFFFFF)
+_ONE = np.uint64(1)
+_ZERO = np.uint64(0)
+
+
+@kernel
+def leaf_value(code: int, x: np.uint64, y: np.uint64, prime: np.uint64, inverse: np.uint64) -> np.uint64:
+    """The payload of op(x, y) for payloads x, y."""
+    if code == FIELD_ADD:
+        return field_add(x, y, prime)
+    if code == FIELD_SUBTRACT:
+        return field_subtract(x, y, prime)
+    if code == FIELD_MULTIPLY:
+        return field_multiply(x, y, prime, inverse)
+    if AND <= code <= DIFFERENCE:
+        if code == AND:
+            return x & y
+        if code == OR:
+            return x | y
+        if code == XOR:
+            return x ^ y
+        return x & (y ^ _ONE)
+    a = np.uint64(x).view(np.float64)
+    b = np.uint64(y).view(np.float64)
+    if code == FLOAT_LESS:
+        if a < b:
+            return _ONE
+        return _ZERO
+    if code == FLOAT_ADD:
+        a = a + b
+    elif code == FLOAT_SUBTRACT:
+        a = a - b
+    elif code == FLOAT_MULTIPLY:
+        a = a * b
+    elif code == FLOAT_MINIMUM:
+        a = min(a, b)
+    else:
+        a = max(a, b)
+    return np.float64(a + 0.0).view(np.uint64)
+
+
+@inline
+def shortcut(op: Int64Array, a: int, b: int) -> Any:
+    """The node op(a, b) where the operator's row decides it, else 0."""
+    if a == b and op[SAME] != 0:
+        if op[SAME] < 0:
+            return a
+        return op[SAME]
+    if a == op[LEFT_IDENTITY]:
+        return b
+    if b == op[RIGHT_IDENTITY]:
+        return a
+    if a == op[LEFT_ABSORBING]:
+        return a
+    if b == op[RIGHT_ABSORBING]:
+        return b
+    return int64(0)
+
+
+@inline
+def cache_index(key: int, a: int, b: int, mask: int) -> int:
+    """Where the computed cache keeps op(a, b)."""
+    h = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h = (h + np.uint64(key)) * np.uint64(0xD6E8FEB86659FD93)
+    return int64(h >> np.uint64(32)) & mask
+
+
+@kernel
+def apply_binary(
+    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array, cache: Int32Array,
+    op: Int64Array, field: npt.NDArray[np.uint64], stack: Int32Array, results: Int32Array,
+    state: Int64Array,
+) -> int:  # fmt: skip
+    """Run op on the frames in `stack`.
+
+    `state` is [frames, results]; the caller puts one frame whose level is -1, a pseudo-node with
+    the pair of roots as its only child.
+    """
+    leaf_level = len(arity) - 1
+    mask = (len(cache) >> 2) - 1
+    key = op[KEY]
+    code = op[CODE]
+    words = np.empty(2, np.int32)
+    sp = state[0]
+    rp = state[1]
+    budget = STEPS
+    while sp > 0:
+        budget -= 1
+        if budget < 0:
+            state[0] = sp
+            state[1] = rp
+            head[2] += STEPS
+            return YIELDED
+        f = 4 * (sp - 1)
+        a = int64(stack[f])
+        b = int64(stack[f + 1])
+        level = stack[f + 2]
+        k = stack[f + 3]
+        if level < 0:
+            if k == 1:
+                break
+        elif k == arity[level]:
+            r = find_or_add(pool, head, unique, arity, level, results, rp - arity[level])
+            if r < 0:
+                state[0] = sp
+                state[1] = rp
+                return FULL
+            i = 4 * cache_index(key, a, b, mask)
+            cache[i] = a
+            cache[i + 1] = b
+            cache[i + 2] = key
+            cache[i + 3] = r
+            rp -= arity[level]
+            results[rp] = r
+            rp += 1
+            sp -= 1
+            continue
+        else:
+            if pool[a] == level:
+                a = int64(pool[a + 2 + k])
+            if pool[b] == level:
+                b = int64(pool[b + 2 + k])
+        r = shortcut(op, a, b)
+        if r == 0:
+            la = pool[a]
+            lb = pool[b]
+            if la == leaf_level and lb == leaf_level:
+                if code == EQUAL:
+                    value = _ZERO
+                elif code == PAIR:
+                    value = (np.uint64(a) << _S32) | np.uint64(b)
+                else:
+                    value = leaf_value(code, payload(pool, a), payload(pool, b), field[0], field[1])
+                words[0] = np.int32(value & _LOW)
+                words[1] = np.int32(value >> _S32)
+                r = find_or_add(pool, head, unique, arity, leaf_level, words, 0)
+                if r < 0:
+                    state[0] = sp
+                    state[1] = rp
+                    return FULL
+            else:
+                if op[COMMUTES] != 0 and a > b:
+                    a, b = b, a
+                    la, lb = lb, la
+                i = 4 * cache_index(key, a, b, mask)
+                if cache[i] == a and cache[i + 1] == b and cache[i + 2] == key:
+                    r = int64(cache[i + 3])
+                else:
+                    stack[f + 3] = k + 1
+                    stack[f + 4] = a
+                    stack[f + 5] = b
+                    stack[f + 6] = min(la, lb)
+                    stack[f + 7] = 0
+                    sp += 1
+                    continue
+        stack[f + 3] = k + 1
+        results[rp] = r
+        rp += 1
+    head[2] += STEPS - budget
+    state[0] = sp
+    state[1] = rp
+    return DONE
+
+
+@kernel
+def choose(
+    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array, cache: Int32Array,
+    true: int, false: int, stack: Int32Array, results: Int32Array, state: Int64Array,
+) -> int:  # fmt: skip
+    """If-then-else of three diagrams, the first with leaves `true` and `false`.
+
+    Frames are [a, b, c, level, next child]; the cache has entries of five words in eight.
+    """
+    mask = (len(cache) >> 3) - 1
+    sp = state[0]
+    rp = state[1]
+    budget = STEPS
+    while sp > 0:
+        budget -= 1
+        if budget < 0:
+            state[0] = sp
+            state[1] = rp
+            head[2] += STEPS
+            return YIELDED
+        f = 5 * (sp - 1)
+        a = int64(stack[f])
+        b = int64(stack[f + 1])
+        c = int64(stack[f + 2])
+        level = stack[f + 3]
+        k = stack[f + 4]
+        if level < 0:
+            if k == 1:
+                break
+        elif k == arity[level]:
+            r = find_or_add(pool, head, unique, arity, level, results, rp - arity[level])
+            if r < 0:
+                state[0] = sp
+                state[1] = rp
+                return FULL
+            i = 8 * (cache_index(c, a, b, mask))
+            cache[i] = a
+            cache[i + 1] = b
+            cache[i + 2] = c
+            cache[i + 3] = r
+            rp -= arity[level]
+            results[rp] = r
+            rp += 1
+            sp -= 1
+            continue
+        else:
+            if pool[a] == level:
+                a = int64(pool[a + 2 + k])
+            if pool[b] == level:
+                b = int64(pool[b + 2 + k])
+            if pool[c] == level:
+                c = int64(pool[c + 2 + k])
+        r = int64(0)
+        if a == true or b == c:
+            r = b
+        elif a == false:
+            r = c
+        elif b == true and c == false:
+            r = a
+        else:
+            i = 8 * cache_index(c, a, b, mask)
+            if cache[i] == a and cache[i + 1] == b and cache[i + 2] == c:
+                r = int64(cache[i + 3])
+            else:
+                stack[f + 4] = k + 1
+                stack[f + 5] = a
+                stack[f + 6] = b
+                stack[f + 7] = c
+                stack[f + 8] = min(pool[a], min(pool[b], pool[c]))
+                stack[f + 9] = 0
+                sp += 1
+                continue
+        stack[f + 4] = k + 1
+        results[rp] = r
+        rp += 1
+    head[2] += STEPS - budget
+    state[0] = sp
+    state[1] = rp
+    return DONE

@@ -1,0 +1,49 @@
+"""The one place where numba is touched by a decorator, typed.
+
+Kernels get flat arrays and integers only, so that the compiled code can be cached on disk and loaded
+by the next process.  They are iterative or call only kernels above them: numba's mutual recursion
+crashes when loaded from its cache.  numba does not notice an edit in a *callee's* file: after
+editing kernels, empty `NUMBA_CACHE_DIR` (or the `__pycache__` folders).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+int64: Callable[[Any], int] = cast(Callable[[Any], int], np.int64)
+"""`np.int64`, which kernels use for offsets, under the type that type checkers understand."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+KERNELS: list[Any] = []
+"""Every compiled function of the package, in order of definition."""
+
+
+def kernel(function: Function) -> Function:
+    """Compile `function` on first use and keep the machine code on disk."""
+    compiled = numba.njit(cache=True, error_model="numpy")(function)
+    KERNELS.append(compiled)
+    return cast(Function, compiled)
+
+
+def inline(function: Function) -> Function:
+    """Compile `function` into each kernel that calls it."""
+    return cast(Function, numba.njit(forceinline=True, error_model="numpy")(function))
+
+
+def compiled_before() -> bool:
+    """Whether machine code of every kernel seen so far lies in numba's cache on disk."""
+    for compiled in KERNELS:
+        try:
+            cache = compiled._cache
+            path = os.path.join(cache._cache_path, cache._cache_file._index_name)
+        except AttributeError:
+            return False
+        if not os.path.exists(path):
+            return False
+    return True

@@ -1,0 +1,314 @@
+"""The manager: the one mutable thing.  It owns the node store, grows it, collects garbage.
+
+One thread owns a manager.  Diagrams are handles into a table of roots; a handle that Python drops
+frees its root, and garbage collection keeps what roots reach and renumbers it.  Kernels that find
+the store full are resumed after growth.  Between slices of a long operation the manager looks for
+Ctrl-C (Python raises it there), for `abort()` called by another thread, and for `deadline`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams.diagram import Diagram
+from factored_polca.diagrams.field import Field
+from factored_polca.diagrams.leaves import FLOAT, INDEX, LeafType, describe
+from factored_polca.diagrams.nodes import (
+    DONE,
+    FIRST,
+    STEPS,
+    YIELDED,
+    Int32Array,
+    Int64Array,
+    compact,
+    make_leaves,
+    rehash,
+)
+
+MAXIMUM_LEVELS: Final = 20_000
+_LARGEST_POOL: Final = 2**31 - 2**16
+
+
+class MemoryLimit(MemoryError):
+    """The node store may not grow further; the manager and all its diagrams stay usable."""
+
+
+class Aborted(RuntimeError):
+    """`abort()` was called or the deadline has passed; the manager stays usable."""
+
+
+def available_memory() -> int:
+    """Bytes of memory that are free now, or 4 GiB where the system does not say."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            for line in file:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, ValueError, OSError):
+        return 4 << 30
+
+
+class Manager:
+    """A store of reduced ordered diagrams over variables with `sizes` values, in this order.
+
+    Args:
+        sizes: the number of values of the variable at each level, the top one first.
+        memory_limit: bytes for nodes and caches together; three quarters of the free memory if None.
+    """
+
+    def __init__(self, sizes: Sequence[int], *, memory_limit: int | None = None) -> None:
+        if len(sizes) > MAXIMUM_LEVELS:
+            raise ValueError(f"{len(sizes)} levels; at most {MAXIMUM_LEVELS} are possible")
+        if any(size < 1 for size in sizes):
+            raise ValueError("every variable needs at least one value")
+        self.sizes: tuple[int, ...] = tuple(int(size) for size in sizes)
+        self.leaf_level = len(self.sizes)
+        self.memory_limit = memory_limit or available_memory() * 3 // 4
+        self.deadline: float | None = None
+        self.peak_nodes = 0
+        self.peak_bytes = 0
+        self.collections = 0
+        self._abort = False
+        self._pinned = 0
+        self._collect_at = 1 << 22
+        self._fields: dict[int, int] = {}
+
+        self.arity: Int32Array = np.array([*self.sizes, 2], dtype=np.int32)
+        self.pool: Int32Array = np.zeros(1 << 16, dtype=np.int32)
+        self.head: Int64Array = np.array([FIRST, 0, 0], dtype=np.int64)
+        self.unique: Int32Array = np.zeros(1 << 14, dtype=np.int32)
+        self.cache: Int32Array = np.zeros(4 << 13, dtype=np.int32)
+        self.choice_cache: Int32Array = np.zeros(8 << 10, dtype=np.int32)
+        self.slots: Int64Array = np.zeros(2 << 12, dtype=np.int64)
+        self.ring: Int32Array = np.zeros(1 << 16, dtype=np.int32)
+        self.ring_state: Int64Array = np.zeros(1, dtype=np.int64)
+        self.roots: Int32Array = np.zeros(1 << 8, dtype=np.int32)
+        self._free = list(range(len(self.roots) - 1, -1, -1))
+
+        levels = self.leaf_level + 3
+        widest = max((*self.sizes, 2))
+        self.stack: Int32Array = np.zeros(5 * levels, dtype=np.int32)
+        self.results: Int32Array = np.zeros(sum(self.sizes) + 2 * widest + levels, dtype=np.int32)
+        self.words: Int32Array = np.zeros(widest, dtype=np.int32)
+        self.terms: Int32Array = np.zeros(2 * widest * levels, dtype=np.int32)
+
+    # -- handles ---------------------------------------------------------------------------
+
+    def handle(self, node: int, leaf_type: LeafType) -> Diagram:
+        """A diagram for `node`, kept alive from now on."""
+        if not self._free:
+            size = len(self.roots)
+            self.roots = np.concatenate([self.roots, np.zeros(size, dtype=np.int32)])
+            self._free.extend(range(2 * size - 1, size - 1, -1))
+        slot = self._free.pop()
+        self.roots[slot] = node
+        return Diagram(self, slot, leaf_type)
+
+    def release(self, slot: int) -> None:
+        """Forget a root; called when a handle is dropped."""
+        self.roots[slot] = 0
+        self._free.append(slot)
+
+    def leaf_nodes(self, payloads: npt.NDArray[np.uint64]) -> Int32Array:
+        """The leaf node of each payload."""
+        out = np.empty(len(payloads), dtype=np.int32)
+        start = 0
+        while start < len(payloads):
+            done = make_leaves(self.pool, self.head, self.unique, self.arity, payloads, out, start)
+            if done < len(payloads):
+                self.grow()
+            start = done
+        return out
+
+    def constant(self, value: int | float, leaf_type: LeafType = INDEX) -> Diagram:
+        """The diagram that is `value` everywhere; for a field an integer mod p."""
+        payload = leaf_type.encode(value)  # type: ignore[arg-type]
+        return self.handle(int(self.leaf_nodes(np.array([payload], dtype=np.uint64))[0]), leaf_type)
+
+    def variable(self, level: int, children: Sequence[Diagram]) -> Diagram:
+        """The diagram that is `children[v]` where the variable at `level` has its value v.
+
+        Raises:
+            ValueError: a wrong number of children, or a child that tests `level` or one above it.
+        """
+        from factored_polca.diagrams.operations import node
+
+        return node(self, level, children)
+
+    def indicator(self, level: int, values: Sequence[int]) -> Diagram:
+        """The condition that the variable at `level` has one of `values`."""
+        true, false = self.constant(1), self.constant(0)
+        chosen = set(values)
+        return self.variable(level, [true if v in chosen else false for v in range(self.sizes[level])])
+
+    def field_number(self, field: Field) -> int:
+        """A small number for a field, for keys of caches."""
+        return self._fields.setdefault(field.prime, len(self._fields) + 1)
+
+    # -- running kernels -------------------------------------------------------------------
+
+    def abort(self) -> None:
+        """Make the operation that runs now, in another thread, raise `Aborted`."""
+        self._abort = True
+
+    def pause(self) -> None:
+        """Look for an abort or the deadline.
+
+        Raises:
+            Aborted: one of them is there.
+        """
+        if self._abort:
+            self._abort = False
+            raise Aborted("the computation was aborted")
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            raise Aborted("the time limit was reached")
+
+    def run(self, step: Callable[[], int]) -> None:
+        """Call the resumable kernel `step` until it is done, growing the store as it asks."""
+        while True:
+            code = step()
+            if code == DONE:
+                return
+            if code == YIELDED:
+                self.pause()
+            else:
+                self.grow()
+
+    def safe_point(self) -> None:
+        """Collect garbage if it is time; called before an operation, when all nodes in use have handles."""
+        self.pause()
+        if self.head[0] > self._collect_at and not self._pinned:
+            self.collect_garbage()
+            self._collect_at = max(1 << 22, 2 * int(self.head[0]))
+
+    def collect_garbage(self) -> None:
+        """Drop every node that no diagram reaches; all handles stay valid, caches are emptied."""
+        self._note_peak()
+        compact(self.pool, self.head, self.arity, self.roots, np.empty(2 * self.leaf_level + 4, np.int32))
+        self.unique[:] = 0
+        rehash(self.pool, self.head, self.unique, self.arity)
+        self.cache[:] = 0
+        self.choice_cache[:] = 0
+        self.slots[:] = 0
+        self.ring_state[0] = 0
+        self.collections += 1
+
+    def grow(self) -> None:
+        """Make room for more nodes.
+
+        Raises:
+            MemoryLimit: `memory_limit` forbids it.
+        """
+        self._note_peak()
+        need = 2 + max((*self.sizes, 2))
+        if self.head[0] + need > len(self.pool):
+            size = min(2 * len(self.pool) + need, _LARGEST_POOL)
+            self._claim(4 * size, size > len(self.pool))
+            pool = np.empty(size, dtype=np.int32)
+            pool[: self.head[0]] = self.pool[: self.head[0]]
+            self.pool = pool
+        if 3 * self.head[1] >= 2 * len(self.unique):
+            self._claim(8 * len(self.unique))
+            self.unique = np.zeros(2 * len(self.unique), dtype=np.int32)
+            rehash(self.pool, self.head, self.unique, self.arity)
+            self._grow_caches()
+
+    def _claim(self, new_bytes: int, possible: bool = True) -> None:
+        if not possible or self.bytes + new_bytes > self.memory_limit:
+            raise MemoryLimit(
+                f"{int(self.head[1]):,} nodes fill the memory limit of {self.memory_limit / 2**20:,.0f} MiB"
+            )
+
+    def _grow_caches(self) -> None:
+        """Double the caches, entries kept: an entry at a wrong place is only never found."""
+        extra = self.cache.nbytes + self.choice_cache.nbytes + self.slots.nbytes + self.ring.nbytes
+        if self.bytes + extra > self.memory_limit // 2 or len(self.cache) >= 4 << 24:
+            return
+        self.cache = np.concatenate([self.cache, self.cache])
+        self.choice_cache = np.concatenate([self.choice_cache, self.choice_cache])
+        self.slots = np.concatenate([self.slots, self.slots])
+        size, end = len(self.ring), int(self.ring_state[0])
+        ring = np.zeros(2 * size, dtype=np.int32)
+        kept = np.arange(max(0, end - size), end)
+        ring[kept & (2 * size - 1)] = self.ring[kept & (size - 1)]
+        self.ring = ring
+
+    # -- figures ---------------------------------------------------------------------------
+
+    @property
+    def bytes(self) -> int:
+        """Bytes held by nodes, tables and caches."""
+        arrays = (self.pool, self.unique, self.cache, self.choice_cache, self.slots, self.ring)
+        return sum(array.nbytes for array in arrays)
+
+    @property
+    def node_count(self) -> int:
+        """Nodes in the store, garbage included."""
+        return int(self.head[1])
+
+    def _note_peak(self) -> None:
+        self.peak_nodes = max(self.peak_nodes, int(self.head[1]))
+        self.peak_bytes = max(self.peak_bytes, self.bytes)
+
+    def peaks(self) -> tuple[int, int]:
+        """The largest number of nodes and of bytes so far."""
+        self._note_peak()
+        return self.peak_nodes, self.peak_bytes
+
+    def assert_consistent(self) -> None:
+        """Check the invariants of the store: order, reduction, uniqueness; for tests.
+
+        Raises:
+            AssertionError: one is broken.
+        """
+        seen: set[tuple[int, ...]] = set()
+        node, count = FIRST, 0
+        while node < self.head[0]:
+            level = int(self.pool[node])
+            words = tuple(int(w) for w in self.pool[node + 2 : node + 2 + self.arity[level]])
+            assert (level, *words) not in seen, "a node is stored twice"
+            seen.add((level, *words))
+            if level < self.leaf_level:
+                assert len(set(words)) > 1, "a node tests nothing"
+                assert all(FIRST <= child < node for child in words), "a child is not below"
+                assert all(self.pool[child] > level for child in words), "levels do not increase"
+            node += 2 + len(words)
+            count += 1
+        assert count == self.head[1], "the number of nodes is wrong"
+
+    def __repr__(self) -> str:
+        return (
+            f"<Manager: {self.leaf_level} levels, {self.node_count:,} nodes, {self.bytes / 2**20:.0f} MiB>"
+        )
+
+
+def require(diagrams: Sequence[Diagram], leaf_type: LeafType | None = None) -> Manager:
+    """The common manager of `diagrams`.
+
+    Raises:
+        ValueError: two managers, two leaf types, or another leaf type than asked for.
+    """
+    manager = diagrams[0].manager
+    wanted = diagrams[0].leaf_type if leaf_type is None else leaf_type
+    for diagram in diagrams:
+        if diagram.manager is not manager:
+            raise ValueError("diagrams of two managers can't be combined; dump and load one of them")
+        if diagram.leaf_type != wanted:
+            raise ValueError(
+                f"a diagram with {describe(diagram.leaf_type)} leaves where "
+                f"{describe(wanted)} leaves are needed"
+            )
+    return manager
+
+
+__all__ = ["FLOAT", "INDEX", "STEPS", "Aborted", "Manager", "MemoryLimit", "available_memory", "require"]

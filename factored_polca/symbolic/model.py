@@ -1,0 +1,334 @@
+"""A model as diagrams.
+
+The variables are interleaved: the feature at position i of the order has level 2i now and level
+2i + 1 next.  For each action a and each feature it changes, a *row diagram* maps the parents to the
+number of a row of exact probabilities; features an action does not change have none.  Reward terms
+are diagrams over x of exact rationals, expectations over x' taken:
+
+    R_a(x) = sum over terms r of E[r(x, x') | x, a].
+
+Where a is not applicable (app_a = applicable and not terminal) rows and rewards mean nothing, so
+faults count only where app_a holds; elsewhere undefined entries are replaced by harmless ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from factored_polca.diagrams import (
+    INDEX,
+    Diagram,
+    Manager,
+    choose,
+    cofactors,
+    combine,
+    leaves,
+    relabel,
+    restrict,
+    states_for_leaves,
+    support,
+)
+from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, check
+from factored_polca.models.expressions import ZERO, Expression, Reference, Undefined, describe, references
+from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, row_of, used
+from factored_polca.symbolic.initial import compile_initial
+from factored_polca.symbolic.order import variable_order
+from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, numbered
+
+@dataclass(frozen=True)
+class SymbolicAction:
+    """An action as diagrams.
+
+    `rows` maps changed features to their row diagrams; `elimination` lists all features, children of
+    synchronic arcs before their parents; `app` is where the action is applicable and x not terminal.
+    """
+
+    name: str
+    rows: dict[int, RowDiagram]
+    elimination: tuple[int, ...]
+    app: Diagram
+    rewards: tuple[Term, ...]
+
+    @property
+    def synchronic(self) -> bool:
+        """Whether some next feature has another next feature as a parent."""
+        return any(row.parents_next for row in self.rows.values())
+
+
+@dataclass(frozen=True)
+class SymbolicModel:
+    """A model compiled to diagrams of one manager; make it with `compile_model`.
+
+    `initial` holds b0 as row diagrams over next variables: a feature's parents are other features
+    of the same, first, time slice.
+    """
+
+    model: Model
+    order: tuple[str, ...]
+    manager: Manager
+    compiler: ExpressionCompiler
+    terminal: Diagram
+    actions: tuple[SymbolicAction, ...]
+    initial: dict[int, RowDiagram]
+    warnings: tuple[Fault, ...] = ()
+    positions: tuple[int, ...] = field(default=())  # [feature] -> position in the order
+
+    def now(self, feature: int) -> int:
+        """The level of a feature in the present state."""
+        return 2 * self.positions[feature]
+
+    def next(self, feature: int) -> int:
+        """The level of a feature in the next state."""
+        return 2 * self.positions[feature] + 1
+
+    @property
+    def now_levels(self) -> list[int]:
+        """The levels of the features in the present state, by feature."""
+        return [self.now(i) for i in range(len(self.model.features))]
+
+    def columns(self) -> list[int]:
+        """For each level the column of its feature in an array of states [row, feature].
+
+        Next variables use columns n, n + 1, ... (an array of pairs of states is [row, 2n]).
+        """
+        count = len(self.model.features)
+        result = [0] * (2 * count)
+        for i in range(count):
+            result[self.now(i)] = i
+            result[self.next(i)] = count + i
+        return result
+
+    def state(self, by_level: Sequence[int]) -> tuple[int, ...]:
+        """A state as value numbers by feature, from values by level."""
+        return tuple(int(by_level[self.now(i)]) for i in range(len(self.model.features)))
+
+    def state_text(self, by_level: Sequence[int]) -> str:
+        """A state as `x=3, y=on`."""
+        values = self.state(by_level)
+        pairs = zip(self.model.features, values, strict=True)
+        return ", ".join(f"{f.name}={_show(f.values[v])}" for f, v in pairs)
+
+
+def _show(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def compile_model(
+    model: Model,
+    *,
+    order: str | Sequence[str] = "auto",
+    tasks: TaskHierarchy | None = None,
+    memory_limit: int | None = None,
+    deadline: float | None = None,
+) -> SymbolicModel:
+    """Compile `model`, checking its structure and its probabilities.
+
+    Args:
+        order: the name of a heuristic (`factored_polca.symbolic.order.ORDERS`) or the features' names
+            from the top level down.
+        tasks: a hierarchy whose conditions the order shall serve too.
+        memory_limit: bytes for the diagrams.
+        deadline: `time.monotonic()` value at which to stop.
+
+    Raises:
+        ModelError: with every fault found.
+        MemoryLimit: diagrams larger than allowed.
+    """
+    faults = [fault for fault in check(model) if fault.severity == "error"]
+    if faults:
+        raise ModelError(faults)
+    names = variable_order(model, order, tasks) if isinstance(order, str) else tuple(order)
+    if sorted(names) != sorted(feature.name for feature in model.features):
+        raise ValueError("a variable order must list every feature once")
+    features = {feature.name: index for index, feature in enumerate(model.features)}
+    position = [0] * len(names)
+    for place, name in enumerate(names):
+        position[features[name]] = place
+    sizes = [size for name in names for size in [len(model.feature(name).values)] * 2]
+    manager = Manager(sizes, memory_limit=memory_limit)
+    manager.deadline = deadline
+    levels = {
+        Reference(name, primed): 2 * position[index] + primed
+        for name, index in features.items()
+        for primed in (False, True)
+    }
+    compiler = ExpressionCompiler(manager, model.features, levels, dict(model.parameters))
+    return _Build(model, names, tuple(position), manager, compiler).finish()
+
+
+class _Build:
+    """Compiles the parts of a model and collects faults."""
+
+    def __init__(
+        self,
+        model: Model,
+        order: tuple[str, ...],
+        positions: tuple[int, ...],
+        manager: Manager,
+        compiler: ExpressionCompiler,
+    ) -> None:
+        self.model, self.order, self.positions = model, order, positions
+        self.manager, self.compiler = manager, compiler
+        self.faults: list[Fault] = []
+        self.false, self.true = manager.constant(0), manager.constant(1)
+
+    def finish(self) -> SymbolicModel:
+        terminal = self.condition(self.model.terminal, ("terminal",), self.true)
+        actions = tuple(self.action(index, terminal) for index in range(len(self.model.actions)))
+        initial = compile_initial(self)
+        if self.faults:
+            raise ModelError(self.faults)
+        return SymbolicModel(
+            self.model, self.order, self.manager, self.compiler, terminal, actions, initial,
+            positions=self.positions,
+        )  # fmt: skip
+
+    def condition(self, expression: Expression, path: tuple[str, ...], where: Diagram) -> Diagram:
+        true, strange = self.compiler.condition(expression)
+        bad = strange & where
+        if bad != self.false:
+            self.report(self.compiler.compile(expression), bad, path, "the condition", "true or false")
+        return true
+
+    def report(
+        self, diagram: Diagram, bad: Diagram, path: tuple[str, ...], what: str, wanted: str
+    ) -> None:
+        """Record one fault with the first state where `diagram` is wrong."""
+        leaf_order = leaves(bad)
+        state = states_for_leaves(bad)[leaf_order.index(1)]
+        number = restrict(diagram, {level: int(v) for level, v in enumerate(state)}).value
+        value = self.compiler.value(int(number))
+        tested = sorted(set(support(diagram)))
+        context = ", ".join(self.level_text(level, int(state[level])) for level in tested)
+        if isinstance(value, Undefined):
+            reason = value.reason
+        elif isinstance(value, Distribution):
+            reason = "a distribution"
+        else:
+            reason = f"the value {describe(value)}"
+        where = f" at {context}" if context else ""
+        self.faults.append(
+            Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}")
+        )
+
+    def level_text(self, level: int, value: int) -> str:
+        feature = self.model.feature(self.order[level // 2])
+        return f"{feature.name}{chr(39) if level % 2 else ''}={_show(feature.values[value])}"
+
+    # -- actions ---------------------------------------------------------------------------
+
+    def action(self, index: int, terminal: Diagram) -> SymbolicAction:
+        action = self.model.actions[index]
+        path = ("actions", action.name)
+        live = ~terminal
+        app = self.condition(action.applicable, (*path, "applicable"), live) & live
+        numbers = {feature.name: i for i, feature in enumerate(self.model.features)}
+        rows: dict[int, RowDiagram] = {}
+        for name, effect in action.effects:
+            if effect == Reference(name):
+                continue
+            rows[numbers[name]] = self.rows(
+                numbers[name], self.compiler.compile(effect), effect, (*path, "effects", name), app
+            )
+        elimination = self.elimination(rows)
+        terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
+        terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
+        rewards = tuple(
+            self.term(expression, where, rows, elimination, app)
+            for expression, where in terms
+            if expression != ZERO
+        )
+        return SymbolicAction(action.name, rows, elimination, app, rewards)
+
+    def rows(
+        self, index: int, compiled: Diagram, effect: Expression, path: tuple[str, ...], where: Diagram
+    ) -> RowDiagram:
+        feature = self.model.features[index]
+        fallback = tuple(Fraction(int(v == 0)) for v in range(len(feature.values)))
+        numbers: dict[Row, int] = {}
+        images = np.zeros(len(self.compiler.table.values), dtype=np.uint64)
+        bad = np.zeros(len(images), dtype=np.uint64)
+        for entry in sorted(used(compiled)):
+            row = row_of(feature, self.compiler.value(entry))
+            if isinstance(row, Undefined):
+                bad[entry] = 1
+                row = fallback
+            images[entry] = numbers.setdefault(row, len(numbers))
+        if bad.any():
+            wrong = relabel(compiled, bad, INDEX) & where
+            if wrong != self.false:
+                self.report_row(feature, compiled, wrong, path)
+        primed = {r.name for r in references(effect) if r.primed}
+        parents = tuple(i for i, f in enumerate(self.model.features) if f.name in primed)
+        return RowDiagram(index, relabel(compiled, images, INDEX), tuple(numbers), parents)
+
+    def report_row(
+        self, feature: Feature, compiled: Diagram, wrong: Diagram, path: tuple[str, ...]
+    ) -> None:
+        """Record the first context where a row is no distribution over the feature's values."""
+        state = states_for_leaves(wrong)[leaves(wrong).index(1)]
+        number = restrict(compiled, {level: int(v) for level, v in enumerate(state)}).value
+        row = row_of(feature, self.compiler.value(int(number)))
+        assert isinstance(row, Undefined)
+        tested = sorted(set(support(compiled)))
+        context = ", ".join(self.level_text(level, int(state[level])) for level in tested)
+        where = f" at {context}" if context else ""
+        hint = f"values of {feature.name!r} are {', '.join(_show(v) for v in feature.values[:12])}"
+        if "sum to" in row.reason:
+            hint = "make the row sum to exactly 1; 0.333 is not 1/3"
+        self.faults.append(Fault(f"the distribution of {feature.name}'{where}: {row.reason}", path, hint))
+
+    def elimination(self, rows: dict[int, RowDiagram]) -> tuple[int, ...]:
+        """All features, those nobody's next value depends on first."""
+        graph = nx.DiGraph()
+        graph.add_nodes_from(range(len(self.model.features)))
+        for row in rows.values():
+            graph.add_edges_from((row.feature, parent) for parent in row.parents_next)
+        key = self.positions.__getitem__
+        return tuple(nx.lexicographical_topological_sort(graph, key=lambda i: -key(i)))
+
+    def term(
+        self,
+        expression: Expression,
+        path: tuple[str, ...],
+        rows: dict[int, RowDiagram],
+        elimination: tuple[int, ...],
+        where: Diagram,
+    ) -> Term:
+        compiled = self.compiler.compile(expression)
+        bad = np.array([not isinstance(v, Fraction) for v in self.compiler.table.values], dtype=np.uint64)
+        for entry in range(len(bad)):
+            if bad[entry] and isinstance(self.compiler.value(entry), bool):
+                bad[entry] = 0  # a condition counts as 0 or 1
+        wrong = relabel(compiled, bad, INDEX) & where
+        if wrong != self.false:
+            self.report(compiled, wrong, path, "the reward", "a number")
+        term = numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+        for index in elimination:
+            level = 2 * self.positions[index] + 1
+            if level in support(term.diagram):
+                term = self.expectation(term, index, level, rows.get(index))
+        return term
+
+    def expectation(self, term: Term, index: int, level: int, row: RowDiagram | None) -> Term:
+        """The term with the next value of one feature summed out."""
+        parts = cofactors(term.diagram, level)
+        if row is None:
+            result = parts[-1]
+            for value in range(len(parts) - 1):
+                result = choose(self.manager.indicator(level - 1, [value]), parts[value], result)
+            return Term(result, term.values)
+
+        def mean(number: int, *entries: int) -> Fraction:
+            pairs = zip(row.rows[number], entries, strict=True)
+            return sum((q * term.values[e] for q, e in pairs if q), Fraction(0))
+
+        diagram, values = combine([row.diagram, *parts], mean)
+        return Term(diagram, tuple(values))
+

@@ -1,0 +1,167 @@
+"""Regression: the back-projection of a function V of the next state through an action,
+
+    R_a[V](x) = sum_x' prod_i P_a(x_i' | x, x') V(x'),
+
+exactly in GF(p), or in floats.  A `NumericView` holds one model's probabilities in one leaf type.
+Without synchronic arcs the regression runs node by node (`factored_polca.diagrams.weighted`).  With
+them, V moves to the next variables, and each next variable is summed out by one weighted sum,
+children before their parents.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams import (
+    FLOAT,
+    Diagram,
+    Field,
+    choose,
+    cofactors,
+    move,
+    relabel,
+    support,
+    weighted_sum,
+)
+from factored_polca.diagrams.manager import STEPS
+from factored_polca.diagrams.operations import Walk, sum_options
+from factored_polca.diagrams.weighted import run_regression
+from factored_polca.symbolic.model import SymbolicModel
+from factored_polca.symbolic.rows import Term
+
+
+@dataclass
+class _Prepared:
+    """The weights of one action as flat arrays for the kernel; remade after garbage collection."""
+
+    handles: list[Diagram]
+    first: npt.NDArray[np.int64]
+    last_changed: int
+    key: int
+    collections: int = -1
+    nodes: npt.NDArray[np.int32] = field(default_factory=lambda: np.empty(0, dtype=np.int32))
+
+
+class NumericView:
+    """The probabilities and rewards of a symbolic model as diagrams with leaves of one type.
+
+    Raises (when a number is first used):
+        ZeroDivisionError: a denominator is divisible by the field's prime.
+    """
+
+    def __init__(self, symbolic: SymbolicModel, leaf_type: Field | type[Any] | Any = FLOAT) -> None:
+        self.symbolic = symbolic
+        self.manager = symbolic.manager
+        self.leaf_type = leaf_type
+        self.zero = self.manager.constant(0, leaf_type)
+        self.one = self.manager.constant(1, leaf_type)
+        self._weights: dict[tuple[int, int], list[Diagram]] = {}
+        self._prepared: dict[int, _Prepared] = {}
+        self._options: tuple[int, npt.NDArray[np.int64]] | None = None
+
+    def stored(self, values: tuple[Fraction, ...] | list[Fraction]) -> npt.NDArray[Any]:
+        """Exact values in the form that leaves hold."""
+        if isinstance(self.leaf_type, Field):
+            return np.array([self.leaf_type.rational(value) for value in values], dtype=np.uint64)
+        return np.array([float(value) for value in values], dtype=np.float64)
+
+    def term(self, term: Term) -> Diagram:
+        """A term with its values as leaves."""
+        return relabel(term.diagram, self.stored(term.values), self.leaf_type)
+
+    def weights(self, action: int, feature: int) -> list[Diagram]:
+        """P_a(x_i' = v | parents) for each v."""
+        key = (action, feature)
+        if key not in self._weights:
+            row = self.symbolic.actions[action].rows.get(feature)
+            if row is None:
+                level = self.symbolic.now(feature)
+                size = len(self.symbolic.model.features[feature].values)
+                parts = [
+                    choose(self.manager.indicator(level, [v]), self.one, self.zero) for v in range(size)
+                ]
+            else:
+                parts = [
+                    relabel(row.diagram, self.stored([r[v] for r in row.rows]), self.leaf_type)
+                    for v in range(len(row.rows[0]))
+                ]
+            self._weights[key] = parts
+        return self._weights[key]
+
+    def regress(self, action: int, value: Diagram) -> Diagram:
+        """R_a[V] for V over the present variables, with no regard to where the action applies."""
+        compiled = self.symbolic.actions[action]
+        if not compiled.rows or value.is_constant:
+            return value
+        if compiled.synchronic:
+            return self.expect(action, self._shift(value))
+        return self._regress_nodes(action, value)
+
+    def _shift(self, value: Diagram) -> Diagram:
+        levels = {2 * i: 2 * i + 1 for i in range(len(self.symbolic.order))}
+        return move(value, levels)
+
+    def expect(self, action: int, value: Diagram) -> Diagram:
+        """The expectation of a function of (x, x') over x', given x and the action."""
+        for feature in self.symbolic.actions[action].elimination:
+            level = self.symbolic.next(feature)
+            if level in support(value):
+                parts = cofactors(value, level)
+                value = weighted_sum(self.weights(action, feature), parts, normalised=True)
+        return value
+
+    def _prepare(self, action: int) -> _Prepared:
+        if action not in self._prepared:
+            handles: list[Diagram] = []
+            first = np.zeros(self.manager.leaf_level + 1, dtype=np.int64)
+            last = -1
+            for feature in range(len(self.symbolic.model.features)):
+                first[self.symbolic.now(feature)] = len(handles)
+                handles.extend(self.weights(action, feature))
+                if feature in self.symbolic.actions[action].rows:
+                    last = max(last, self.symbolic.now(feature))
+            number = (
+                self.manager.field_number(self.leaf_type) if isinstance(self.leaf_type, Field) else 0
+            )
+            key = 1_000_003 + action * 4096 + number
+            self._prepared[action] = _Prepared(handles, first, last, key)
+        prepared = self._prepared[action]
+        if prepared.collections != self.manager.collections:
+            prepared.nodes = np.array([handle.node for handle in prepared.handles], dtype=np.int32)
+            prepared.collections = self.manager.collections
+        return prepared
+
+    def _regress_nodes(self, action: int, value: Diagram) -> Diagram:
+        manager = self.manager
+        self._prepare(action)
+        manager.safe_point()
+        prepared = self._prepare(action)
+        field_parameters = (
+            self.leaf_type.parameters
+            if isinstance(self.leaf_type, Field)
+            else np.array([3, 1], dtype=np.uint64)
+        )
+        if self._options is None or self._options[0] != manager.collections:
+            self._options = (manager.collections, sum_options(manager, self.leaf_type, True))
+        options = self._options[1]
+        walk = Walk(value)
+        regressed = np.empty(len(walk.nodes), dtype=np.int32)
+        progress = np.zeros(2, dtype=np.int64)
+        state = np.array([0, 0, STEPS], dtype=np.int64)
+
+        def step() -> int:
+            m = manager
+            return run_regression(
+                m.pool, m.head, m.unique, m.arity, m.slots, m.ring, m.ring_state, options,
+                field_parameters, m.stack, m.terms, m.results, state, m.cache, prepared.key,
+                walk.nodes, len(walk.nodes), prepared.nodes, prepared.first, prepared.last_changed,
+                regressed, progress,
+            )  # fmt: skip
+
+        manager.run(step)
+        return manager.handle(int(regressed[-1]), self.leaf_type)

@@ -1,0 +1,50 @@
+"""Row diagrams and terms: an index diagram together with the exact things its leaves number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from factored_polca.diagrams import INDEX, Diagram, leaves, relabel
+
+Row = tuple[Fraction, ...]
+"""The probability of each value of a feature."""
+
+
+@dataclass(frozen=True)
+class RowDiagram:
+    """P(x_i' | parents): `diagram` maps parents to the number of a row, `rows[number]` is the row."""
+
+    feature: int
+    diagram: Diagram
+    rows: tuple[Row, ...]
+    parents_next: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Term:
+    """A function of x with exact values: `diagram` maps x to the number of an entry of `values`."""
+
+    diagram: Diagram
+    values: tuple[Fraction, ...]
+
+
+def as_number(value: object) -> Fraction:
+    """The rational behind an entry of a value table: a condition counts 0 or 1, others as they are."""
+    if isinstance(value, bool):
+        return Fraction(int(value))
+    return value if isinstance(value, Fraction) else Fraction(0)
+
+
+def numbered(diagram: Diagram, value: Callable[[int], Any]) -> Term:
+    """A term from an index diagram and the exact value of each of its leaves."""
+    found: dict[Fraction, int] = {}
+    entries = [int(leaf) for leaf in leaves(diagram)]
+    images = np.zeros(max(entries) + 1, dtype=np.uint64)
+    for entry in entries:
+        images[entry] = found.setdefault(value(entry), len(found))
+    return Term(relabel(diagram, images, INDEX), tuple(found))
+
