@@ -73,7 +73,9 @@ def _conditioned(build: _Build, rows: dict[int, RowDiagram]) -> dict[int, RowDia
         bad = np.array([not isinstance(v, (Fraction, bool)) or v < 0 for v in table], dtype=np.uint64)
         wrong = relabel(compiled, bad, INDEX)
         if wrong != build.false:
-            build.report(compiled, wrong, ("initial", "factors", str(number)), "the factor", "a number >= 0")
+            build.report(
+                compiled, wrong, ("initial", "factors", str(number)), "the factor", "a number >= 0"
+            )
             return {}
         product = _times(product, numbered(compiled, lambda n: as_number(build.compiler.value(n))))
     order = sorted(involved, key=build.positions.__getitem__)
@@ -92,14 +94,14 @@ def _conditioned(build: _Build, rows: dict[int, RowDiagram]) -> dict[int, RowDia
         level = 2 * build.positions[index] + 1
         parts = cofactors(joint.diagram, level)
 
-        def row(*entries: int, values: tuple[Fraction, ...] = joint.values) -> tuple[Fraction, ...]:
+        def conditioned(*entries: int, values: tuple[Fraction, ...] = joint.values) -> tuple[Fraction, ...]:
             weights = [values[e] for e in entries]
             whole = sum(weights, Fraction(0))
             if whole == 0:
                 return tuple(Fraction(int(v == 0)) for v in range(len(weights)))
             return tuple(weight / whole for weight in weights)
 
-        diagram, found = combine(parts, row)
+        diagram, found = combine(parts, conditioned)
         parents = tuple(j for j in order[:place] if 2 * build.positions[j] + 1 in support(diagram))
         result[index] = RowDiagram(index, diagram, tuple(found), parents)
     return result
@@ -128,4 +130,3 @@ def _sum_out(term: Term, level: int) -> Term:
         cofactors(term.diagram, level), lambda *entries: sum((term.values[e] for e in entries), Fraction(0))
     )
     return Term(diagram, tuple(values))
-

@@ -13,10 +13,9 @@ faults count only where app_a holds; elsewhere undefined entries are replaced by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -40,6 +39,7 @@ from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler
 from factored_polca.symbolic.initial import compile_initial
 from factored_polca.symbolic.order import variable_order
 from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, numbered
+
 
 @dataclass(frozen=True)
 class SymbolicAction:
@@ -196,9 +196,7 @@ class _Build:
             self.report(self.compiler.compile(expression), bad, path, "the condition", "true or false")
         return true
 
-    def report(
-        self, diagram: Diagram, bad: Diagram, path: tuple[str, ...], what: str, wanted: str
-    ) -> None:
+    def report(self, diagram: Diagram, bad: Diagram, path: tuple[str, ...], what: str, wanted: str) -> None:
         """Record one fault with the first state where `diagram` is wrong."""
         leaf_order = leaves(bad)
         state = states_for_leaves(bad)[leaf_order.index(1)]
@@ -213,9 +211,7 @@ class _Build:
         else:
             reason = f"the value {describe(value)}"
         where = f" at {context}" if context else ""
-        self.faults.append(
-            Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}")
-        )
+        self.faults.append(Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}"))
 
     def level_text(self, level: int, value: int) -> str:
         feature = self.model.feature(self.order[level // 2])
@@ -237,6 +233,7 @@ class _Build:
                 numbers[name], self.compiler.compile(effect), effect, (*path, "effects", name), app
             )
         elimination = self.elimination(rows)
+        terms: list[tuple[Expression, tuple[str, ...]]]
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
         terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
         rewards = tuple(
@@ -331,4 +328,3 @@ class _Build:
 
         diagram, values = combine([row.diagram, *parts], mean)
         return Term(diagram, tuple(values))
-

@@ -123,9 +123,7 @@ def spectral(order: Sequence[str], found: Sequence[Group]) -> list[str]:
     return result
 
 
-def variable_order(
-    model: Model, name: str = "auto", tasks: TaskHierarchy | None = None
-) -> tuple[str, ...]:
+def variable_order(model: Model, name: str = "auto", tasks: TaskHierarchy | None = None) -> tuple[str, ...]:
     """The features from the top level down.
 
     Raises:
@@ -141,7 +139,8 @@ def variable_order(
         return tuple(force(given, found))
     if name == "spectral":
         return tuple(spectral(given, found))
-    candidates = [given, force(given, found)]
+    candidates: list[list[str]] = [given, force(given, found)]
     if len(given) <= 200:
         candidates.append(force(spectral(given, found), found))
-    return tuple(min(candidates, key=lambda order: total_span(order, found)))
+    spans = [total_span(candidate, found) for candidate in candidates]
+    return tuple(candidates[spans.index(min(spans))])

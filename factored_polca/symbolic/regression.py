@@ -21,6 +21,7 @@ from factored_polca.diagrams import (
     FLOAT,
     Diagram,
     Field,
+    LeafType,
     choose,
     cofactors,
     move,
@@ -54,7 +55,7 @@ class NumericView:
         ZeroDivisionError: a denominator is divisible by the field's prime.
     """
 
-    def __init__(self, symbolic: SymbolicModel, leaf_type: Field | type[Any] | Any = FLOAT) -> None:
+    def __init__(self, symbolic: SymbolicModel, leaf_type: LeafType = FLOAT) -> None:
         self.symbolic = symbolic
         self.manager = symbolic.manager
         self.leaf_type = leaf_type
@@ -125,9 +126,7 @@ class NumericView:
                 handles.extend(self.weights(action, feature))
                 if feature in self.symbolic.actions[action].rows:
                     last = max(last, self.symbolic.now(feature))
-            number = (
-                self.manager.field_number(self.leaf_type) if isinstance(self.leaf_type, Field) else 0
-            )
+            number = self.manager.field_number(self.leaf_type) if isinstance(self.leaf_type, Field) else 0
             key = 1_000_003 + action * 4096 + number
             self._prepared[action] = _Prepared(handles, first, last, key)
         prepared = self._prepared[action]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -47,4 +48,3 @@ def numbered(diagram: Diagram, value: Callable[[int], Any]) -> Term:
     for entry in entries:
         images[entry] = found.setdefault(value(entry), len(found))
     return Term(relabel(diagram, images, INDEX), tuple(found))
-

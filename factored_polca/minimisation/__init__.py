@@ -1,0 +1,21 @@
+"""Exact model minimisation on diagrams: criterion, partition, refinement, quotient, the way back."""
+
+from factored_polca.minimisation.criterion import Choice, DecisionProcess, flat_process
+from factored_polca.minimisation.partition import Partition, partition_from
+from factored_polca.minimisation.quotient import Quotient, make_quotient
+from factored_polca.minimisation.reduction import Reduction, reduce
+from factored_polca.minimisation.refine import Minimisation, minimise
+
+__all__ = [
+    "Choice",
+    "DecisionProcess",
+    "Minimisation",
+    "Partition",
+    "Quotient",
+    "Reduction",
+    "flat_process",
+    "make_quotient",
+    "minimise",
+    "partition_from",
+    "reduce",
+]

@@ -1,0 +1,130 @@
+"""What a minimisation must preserve: a decision process over the states of a symbolic model.
+
+A `DecisionProcess` is a model, or one subtask of it.  Its choices are primitive actions, or
+abstract actions: a child's finished policy, given as a diagram from states to primitive actions.
+Everything is masked: with app_c = where choice c is applicable and the process not terminal,
+rewards and transitions count only where app_c holds (Dean & Givan 1997; DESIGN 4, "masks first").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from factored_polca.diagrams import Diagram, choose, leaves
+from factored_polca.symbolic import NumericView, SymbolicModel, Term
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An action of a decision process.
+
+    `primitives` are numbers of the model's actions; where there is a `policy`, it maps each state to
+    the number of the one that is taken (any other leaf where the choice is not applicable), and
+    without one there is a single primitive.
+    """
+
+    name: str
+    app: Diagram
+    primitives: tuple[int, ...]
+    policy: Diagram | None = None
+
+    def where(self, primitive: int) -> Diagram:
+        """The condition that the choice stands for `primitive`."""
+        manager = self.app.manager
+        if self.policy is None:
+            return manager.constant(1)
+        return self.policy.equals(manager.constant(primitive))
+
+
+@dataclass(frozen=True)
+class DecisionProcess:
+    """States of a symbolic model, choices, a terminal set, and the reward of each primitive action.
+
+    `rewards[p]` are the terms that primitive p earns here; `reachable` restricts attention to a set
+    of states that no choice leaves (None: all).
+    """
+
+    symbolic: SymbolicModel
+    choices: tuple[Choice, ...]
+    terminal: Diagram
+    rewards: dict[int, tuple[Term, ...]]
+    reachable: Diagram | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the choices."""
+        return tuple(choice.name for choice in self.choices)
+
+
+def flat_process(
+    symbolic: SymbolicModel,
+    actions: Sequence[str] | None = None,
+    reachable: Diagram | None = None,
+) -> DecisionProcess:
+    """The decision process of the model itself, or of some of its actions.
+
+    Raises:
+        KeyError: an unknown action; the message lists those there are.
+    """
+    names = [action.name for action in symbolic.actions]
+    wanted = names if actions is None else list(actions)
+    for name in wanted:
+        if name not in names:
+            raise KeyError(f"no action {name!r}; there are {', '.join(names)}")
+    numbers = [names.index(name) for name in wanted]
+    choices = tuple(Choice(names[n], symbolic.actions[n].app, (n,)) for n in numbers)
+    rewards = {n: symbolic.actions[n].rewards for n in numbers}
+    return DecisionProcess(symbolic, choices, symbolic.terminal, rewards, reachable)
+
+
+class ProcessView:
+    """A decision process in numbers of one leaf type: masked rewards and regressions.
+
+    Regressions of a primitive are shared by all choices that stand for it.
+    """
+
+    def __init__(self, process: DecisionProcess, numbers: NumericView) -> None:
+        self.process = process
+        self.numbers = numbers
+        self._rewards: dict[int, Diagram] = {}
+
+    def app(self, choice: Choice) -> Diagram:
+        """Where the choice counts."""
+        reachable = self.process.reachable
+        return choice.app if reachable is None else choice.app & reachable
+
+    def _primitive_reward(self, primitive: int) -> Diagram:
+        if primitive not in self._rewards:
+            total = self.numbers.zero
+            for term in self.process.rewards[primitive]:
+                total = total + self.numbers.term(term)
+            self._rewards[primitive] = total
+        return self._rewards[primitive]
+
+    def _select(self, choice: Choice, parts: dict[int, Diagram]) -> Diagram:
+        result = self.numbers.zero
+        for primitive, part in parts.items():
+            result = choose(choice.where(primitive), part, result)
+        return choose(self.app(choice), result, self.numbers.zero)
+
+    def reward(self, choice: Choice) -> Diagram:
+        """R_c(x), 0 where the choice is not applicable."""
+        return self._select(choice, {p: self._primitive_reward(p) for p in choice.primitives})
+
+    def regress(self, choice: Choice, value: Diagram, memo: dict[int, Diagram]) -> Diagram:
+        """sum_x' T_c(x, x') V(x'), 0 where the choice is not applicable.
+
+        `memo` keeps the regressions of primitives of this `value`.
+        """
+        for primitive in choice.primitives:
+            if primitive not in memo:
+                memo[primitive] = self.numbers.regress(primitive, value)
+        return self._select(choice, {p: memo[p] for p in choice.primitives})
+
+
+def policy_primitives(policy: Diagram, defined: Diagram, count: int) -> tuple[int, ...]:
+    """The primitive actions (numbers below `count`) that a policy takes where it is defined."""
+    manager = policy.manager
+    masked = choose(defined, policy, manager.constant(count))
+    return tuple(sorted(int(leaf) for leaf in leaves(masked) if int(leaf) < count))

@@ -1,0 +1,204 @@
+"""The quotient: a small decision process over the blocks of a partition.
+
+    T_c(C, C') = sum_{x' in C'} T(x_C, p, x')      R_c(C) = R(x_C, p)       (the paper's Eqs. 10, 11)
+
+with x_C the representative of block C and p the primitive that choice c stands for there.  Rows are
+floats by default; `exact_row` gives rationals.  Block numbers are those of the partition; a block is
+terminal if its states are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from factored_polca.diagrams import evaluate_states
+from factored_polca.explicit.arrays import ArrayMDP
+from factored_polca.minimisation.criterion import Choice, DecisionProcess
+from factored_polca.minimisation.partition import Partition
+from factored_polca.minimisation.push import (
+    PushPlan,
+    RowTable,
+    make_plan,
+    push_exact,
+    push_floats,
+    row_table,
+    rows_at,
+)
+from factored_polca.symbolic import RowDiagram
+
+
+@dataclass(frozen=True)
+class Quotient:
+    """A decision process over blocks, and what its exact rows are made from.
+
+    `primitive[c, b]` is the primitive that choice c stands for in block b, -1 where not applicable.
+    """
+
+    process: DecisionProcess
+    partition: Partition
+    mdp: ArrayMDP
+    primitive: npt.NDArray[np.int32]
+    _plans: dict[int, tuple[PushPlan, RowTable]] = field(default_factory=dict, repr=False)
+
+    def exact_row(self, choice: int, block: int) -> dict[int, Fraction]:
+        """The exact probability of each next block; empty where the choice is not applicable."""
+        primitive = int(self.primitive[choice, block])
+        if primitive < 0:
+            return {}
+        symbolic = self.process.symbolic
+        plan, table = self._plans[primitive]
+        states = feature_states(self.partition)[block : block + 1]
+        rows = symbolic.actions[primitive].rows
+        return push_exact(plan, table, rows_at(symbolic, rows, table, plan.slots, states)[0])
+
+    def exact_reward(self, choice: int, block: int) -> Fraction:
+        """The exact reward; 0 where the choice is not applicable."""
+        primitive = int(self.primitive[choice, block])
+        if primitive < 0:
+            return Fraction(0)
+        states = feature_states(self.partition)[block : block + 1]
+        return exact_rewards(self.process, primitive, states)[0]
+
+
+def feature_states(partition: Partition) -> npt.NDArray[np.int32]:
+    """The representatives as value numbers by feature: int32 [block, feature]."""
+    return np.ascontiguousarray(partition.representatives[:, partition.symbolic.now_levels])
+
+
+def exact_rewards(
+    process: DecisionProcess, primitive: int, states: npt.NDArray[np.int32]
+) -> list[Fraction]:
+    """The reward of a primitive at states [state, feature], as exact sums of its terms."""
+    columns = process.symbolic.columns()
+    totals = [Fraction(0)] * len(states)
+    for term in process.rewards[primitive]:
+        leaf = evaluate_states(term.diagram, states, columns)
+        for i, number in enumerate(leaf.tolist()):
+            totals[i] += term.values[number]
+    return totals
+
+
+def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
+    """The quotient of `process` by a stable partition of it."""
+    symbolic = process.symbolic
+    states = feature_states(partition)
+    columns = symbolic.columns()
+    blocks = partition.blocks
+    primitive = np.full((len(process.choices), blocks), -1, dtype=np.int32)
+    for c, choice in enumerate(process.choices):
+        primitive[c] = primitives_at(choice, states, columns)
+    terminal = evaluate_states(process.terminal, states, columns).astype(bool)
+    plans: dict[int, tuple[PushPlan, RowTable]] = {}
+    rewards = np.zeros((len(process.choices), blocks))
+    matrices: dict[int, tuple[npt.NDArray[np.int64], Any]] = {}
+    for p in sorted({int(p) for p in np.unique(primitive)} - {-1}):
+        chosen_blocks = np.flatnonzero((primitive == p).any(axis=0))
+        rows = symbolic.actions[p].rows
+        plans[p] = (make_plan(symbolic, partition.diagram, rows), row_table(symbolic, rows))
+        matrix = push_states(partition, rows, *plans[p], states[chosen_blocks])
+        matrices[p] = (chosen_blocks, matrix)
+        exact = exact_rewards(process, p, states[chosen_blocks])
+        gains = np.array([float(value) for value in exact])
+        for c in range(len(process.choices)):
+            mine = primitive[c, chosen_blocks] == p
+            rewards[c, chosen_blocks[mine]] = gains[mine]
+    transitions = tuple(_choice_matrix(primitive[c], matrices, blocks) for c in range(len(process.choices)))
+    mdp = ArrayMDP(
+        process.names, transitions, rewards, primitive >= 0, terminal, float(symbolic.model.discount)
+    )
+    return Quotient(process, partition, mdp, primitive, plans)
+
+
+def primitives_at(
+    choice: Choice, states: npt.NDArray[np.int32], columns: list[int]
+) -> npt.NDArray[np.int32]:
+    """The primitive that a choice stands for at each state [state, feature], -1 where not applicable."""
+    app = evaluate_states(choice.app, states, columns).astype(bool)
+    if choice.policy is None:
+        return np.where(app, choice.primitives[0], -1).astype(np.int32)
+    taken = evaluate_states(choice.policy, states, columns).astype(np.int64)
+    return np.where(app, taken, -1).astype(np.int32)
+
+
+def push_states(
+    partition: Partition,
+    rows: Mapping[int, RowDiagram],
+    plan: PushPlan,
+    table: RowTable,
+    states: npt.NDArray[np.int32],
+) -> Any:
+    """The float rows of states [state, feature] over blocks, as a CSR array."""
+    symbolic = partition.symbolic
+    chosen = rows_at(symbolic, rows, table, plan.slots, states)
+    row_ends = np.zeros(len(states), dtype=np.int64)
+    room = max(1024, 8 * len(states))
+    blocks, masses = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
+    state = np.zeros(2, dtype=np.int64)
+    while True:
+        symbolic.manager.pause()
+        code = push_floats(
+            plan.roots, plan.slot, plan.first_child, plan.children, plan.leaf,
+            table.start, table.value, table.probability, chosen, row_ends, blocks, masses, state,
+        )  # fmt: skip
+        if code == 0:
+            break
+        more = max(len(blocks), partition.blocks)
+        blocks = np.concatenate([blocks, np.empty(more, dtype=np.int64)])
+        masses = np.concatenate([masses, np.empty(more, dtype=np.float64)])
+    pointers = np.concatenate([[0], row_ends])
+    shape = (len(states), partition.blocks + partition.has_outside)
+    return sparse.csr_array((masses[: state[1]], blocks[: state[1]], pointers), shape=shape)
+
+
+def _choice_matrix(
+    primitive: npt.NDArray[np.int32],
+    matrices: dict[int, tuple[npt.NDArray[np.int64], Any]],
+    blocks: int,
+) -> Any:
+    """The rows of one choice, gathered from those of the primitives it stands for."""
+    pieces, targets = [], []
+    for p, (chosen_blocks, matrix) in matrices.items():
+        mine = np.flatnonzero(primitive[chosen_blocks] == p)
+        if len(mine):
+            pieces.append(matrix[mine][:, :blocks])
+            targets.append(chosen_blocks[mine])
+    if not pieces:
+        return sparse.csr_array((blocks, blocks))
+    stacked = sparse.vstack(pieces, format="csr")
+    order = np.concatenate(targets)
+    place = np.full(blocks, -1, dtype=np.int64)
+    place[order] = np.arange(len(order))
+    lengths = np.where(place >= 0, np.diff(stacked.indptr)[place], 0)
+    selected = stacked[place[place >= 0]]
+    pointers = np.concatenate([[0], np.cumsum(lengths)])
+    return sparse.csr_array((selected.data, selected.indices, pointers), shape=(blocks, blocks))
+
+
+def initial_distribution(partition: Partition) -> npt.NDArray[np.float64]:
+    """b0 over blocks, as floats [block]."""
+    symbolic = partition.symbolic
+    plan, table = (
+        make_plan(symbolic, partition.diagram, symbolic.initial),
+        row_table(symbolic, symbolic.initial),
+    )
+    nowhere = np.zeros((1, len(symbolic.model.features)), dtype=np.int32)
+    row = push_states(partition, symbolic.initial, plan, table, nowhere)
+    return np.asarray(row.toarray()[0, : partition.blocks])
+
+
+def exact_initial_distribution(partition: Partition) -> dict[int, Fraction]:
+    """b0 over blocks, exactly."""
+    symbolic = partition.symbolic
+    plan, table = (
+        make_plan(symbolic, partition.diagram, symbolic.initial),
+        row_table(symbolic, symbolic.initial),
+    )
+    nowhere = np.zeros((1, len(symbolic.model.features)), dtype=np.int32)
+    return push_exact(plan, table, rows_at(symbolic, symbolic.initial, table, plan.slots, nowhere)[0])

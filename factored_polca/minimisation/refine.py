@@ -1,0 +1,279 @@
+"""The coarsest stable partition by fingerprints (DESIGN 4; Dean & Givan 1997, Eqs. 3-5 of the paper).
+
+Letters: P partition (state -> block), r_k random field element of block k, V = r o P, f_c = R_c[V]
+regression through choice c, masked.
+
+    0. P_0 separates states by terminal flag, applicable choices and rewards.
+    1. one pass: for each choice c, V = r o P, f_c = R_c[V]; P becomes the distinct pairs (P, f_c).
+    2. a pass without a split ends the refinement;
+    3. a confirming pass repeats 0 and 1 with fresh draws and another, random, prime; a split there
+       sends the refinement on with that prime.
+
+f_c(x) = sum_k r_k T_c(x, k) is a random linear form of the row T_c(x, .).  Equal rows give equal
+leaves, since arithmetic is exact: there is no false split, and the result is never finer than the
+coarsest stable partition.  Two rows that differ mod p get equal leaves with probability at most 1/p
+over r (Schwartz 1980; Zippel 1979).  Rows that differ over the rationals may agree mod one prime; if
+the cleared numerator of their difference has B bits, at most B/60 of the 2.7 * 10^16 primes in
+[2^60, 2^61) divide it.  A partition that is too coarse has, whatever happened before, a pair of
+states in one block with different rows, rewards or masks that is fixed before the confirming draws,
+and passes with probability at most
+
+    B/60 / 2.7 * 10^16 + 2 / 2^60,
+
+which is reported, raised to the number of confirming rounds that passed in a row.
+
+A block that is not split keeps its r_k (of a block that is, one part does), so that most of V, and
+with it most cached regressions, survive from pass to pass; and a choice whose f_c is the diagram it
+was before needs no pairing.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from math import lcm
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams import (
+    Aborted,
+    Diagram,
+    Field,
+    MemoryLimit,
+    pairs,
+    random_prime,
+    relabel,
+)
+from factored_polca.diagrams.operations import leaf_payloads
+from factored_polca.minimisation.criterion import DecisionProcess, ProcessView
+from factored_polca.minimisation.partition import Partition, partition_from
+from factored_polca.models import LimitReached
+from factored_polca.symbolic import NumericView
+
+PRIMES_IN_RANGE = 2.7e16
+"""A lower bound on the number of primes in [2^60, 2^61): 2^60 / ln(2^61) = 2.72e16 (Rosser &
+Schoenfeld 1962 give pi(2x) - pi(x) > 0.6 x / ln x; the density at 2^61 is 1 / 42.3)."""
+
+
+@dataclass(frozen=True)
+class Minimisation:
+    """A partition and how it was found.
+
+    `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the
+    probability that the partition is coarser than the coarsest stable one.
+    """
+
+    process: DecisionProcess
+    partition: Partition
+    rounds: int
+    primes: tuple[int, ...]
+    collision_bound: float
+    seconds: float
+
+
+Progress = Callable[[int, int], None]
+"""Called after each pass with the round's number and the blocks so far."""
+
+
+@dataclass
+class _Labels:
+    """A partition under way: its diagram, its blocks, and the random element of each."""
+
+    diagram: Diagram
+    elements: npt.NDArray[np.uint64]
+
+    @property
+    def blocks(self) -> int:
+        return len(self.elements)
+
+
+def minimise(
+    process: DecisionProcess,
+    *,
+    seed: int = 0,
+    confirmations: int = 1,
+    block_limit: int | None = None,
+    progress: Progress | None = None,
+) -> Minimisation:
+    """The coarsest stable partition of `process` that separates different rewards.
+
+    Args:
+        seed: of the random elements; the partition does not depend on it but with probability
+            `collision_bound`.
+        confirmations: how many confirming rounds must pass.
+        block_limit: stop beyond so many blocks.
+
+    Raises:
+        LimitReached: blocks, memory or time; `partial` is the partition so far.
+    """
+    refinement = _Refinement(process, seed, block_limit, progress)
+    start = time.perf_counter()
+    try:
+        refinement.run(confirmations)
+    except (MemoryLimit, Aborted) as error:
+        raise LimitReached(
+            f"minimisation stopped in round {refinement.rounds + 1} at "
+            f"{refinement.labels.blocks:,} blocks: {error}",
+            "minimisation",
+            refinement.partition(),
+        ) from None
+    bound = refinement.bound() ** confirmations
+    seconds = time.perf_counter() - start
+    primes = tuple(refinement.primes)
+    return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
+
+
+class _Refinement:
+    """The working state of one minimisation."""
+
+    def __init__(
+        self, process: DecisionProcess, seed: int, block_limit: int | None, progress: Progress | None
+    ) -> None:
+        self.process = process
+        self.manager = process.symbolic.manager
+        self.random = random.Random(seed)
+        self.generator = np.random.default_rng(seed)
+        self.block_limit = block_limit
+        self.progress = progress
+        self.rounds = 0
+        self.primes: list[int] = []
+        self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
+        self.previous: dict[int, Diagram] = {}
+        self.use(Field())
+
+    def use(self, field: Field) -> None:
+        """Go on in another field, with fresh draws; start from the present partition."""
+        self.field = field
+        self.primes.append(field.prime)
+        self.view = ProcessView(self.process, NumericView(self.process.symbolic, field))
+        self.previous.clear()
+        self.labels.elements = field.draw(self.generator, self.labels.blocks)
+
+    def run(self, confirmations: int) -> None:
+        self.begin()
+        self.refine()
+        passed = 0
+        while passed < confirmations:
+            self.use(Field(self.fresh_prime()))
+            before = self.labels.blocks
+            self.begin()
+            if self.one_pass() or self.labels.blocks > before:
+                passed = 0
+                self.refine()
+            else:
+                passed += 1
+
+    def fresh_prime(self) -> int:
+        """A random prime not used yet that divides no denominator of the model."""
+        while True:
+            prime = random_prime(self.random)
+            if prime not in self.primes and self.denominators() % prime:
+                return prime
+
+    def denominators(self) -> int:
+        """A common multiple of all denominators."""
+        common = 1
+        for choice in self.process.choices:
+            for primitive in choice.primitives:
+                action = self.process.symbolic.actions[primitive]
+                for row in action.rows.values():
+                    common = lcm(common, *(q.denominator for r in row.rows for q in r))
+                for term in self.process.rewards[primitive]:
+                    common = lcm(common, *(value.denominator for value in term.values))
+        return common
+
+    def begin(self) -> None:
+        """Separate by reachability, terminal flag, applicable choices and rewards."""
+        reachable = self.process.reachable
+        terminal = self.process.terminal
+        if reachable is not None:
+            self.split(reachable)
+            terminal = terminal & reachable
+        self.split(terminal)
+        for choice in self.process.choices:
+            self.split(self.view.app(choice))
+        for choice in self.process.choices:
+            self.split(self.view.reward(choice))
+
+    def refine(self) -> None:
+        while self.one_pass():
+            pass
+
+    def one_pass(self) -> bool:
+        """Refine by every choice; answer whether a block was split."""
+        before = self.labels.blocks
+        memo: dict[int, Diagram] = {}
+        value = relabel(self.labels.diagram, self.labels.elements, self.field)
+        for number, choice in enumerate(self.process.choices):
+            regressed = self.view.regress(choice, value, memo)
+            if self.previous.get(number) == regressed:
+                continue
+            self.previous[number] = regressed
+            self.split(regressed)
+        self.rounds += 1
+        if self.progress is not None:
+            self.progress(self.rounds, self.labels.blocks)
+        return self.labels.blocks > before
+
+    def split(self, by: Diagram) -> None:
+        """Replace the partition by the distinct pairs (block, leaf of `by`)."""
+        if by.is_constant:
+            return
+        numbered, old_leaf, _ = pairs(self.labels.diagram, by)
+        old = leaf_payloads(self.manager, old_leaf).astype(np.int64)
+        if len(old) == self.labels.blocks:
+            return
+        elements = np.zeros(len(old), dtype=np.uint64)
+        _, first = np.unique(old, return_index=True)
+        elements[first] = self.labels.elements[old[first]]
+        fresh = np.ones(len(old), dtype=bool)
+        fresh[first] = False
+        elements[fresh] = self.draw_new(int(fresh.sum()), elements[first])
+        self.labels = _Labels(numbered, elements)
+        if self.block_limit is not None and self.labels.blocks > self.block_limit:
+            raise LimitReached(
+                f"more than {self.block_limit:,} blocks after {self.rounds} rounds",
+                "minimisation",
+                self.partition(),
+            )
+
+    def draw_new(self, count: int, taken: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+        """Random elements different from each other and from those in use."""
+        drawn = self.field.draw(self.generator, count)
+        while np.isin(drawn, taken).any():
+            drawn = self.field.draw(self.generator, count)
+        return drawn
+
+    def partition(self) -> Partition:
+        """The present partition, numbered canonically."""
+        reachable = self.process.reachable
+        return partition_from(self.process.symbolic, self.labels.diagram, reachable)
+
+    def bound(self) -> float:
+        """The probability that one confirming round lets a wrong partition pass."""
+        return difference_bits(self.process) / 60 / PRIMES_IN_RANGE + 2.0 / 2**60
+
+
+def difference_bits(process: DecisionProcess) -> int:
+    """Bits of the largest cleared numerator of a difference of two rows or rewards.
+
+    An entry of a row of action a is n / D with 0 <= n <= D = prod_i lcm(denominators of feature i's
+    rows), since entries of one row sum to 1; rewards are bounded term by term.
+    """
+    bits = 1
+    for primitive in {p for choice in process.choices for p in choice.primitives}:
+        action = process.symbolic.actions[primitive]
+        denominator = 1
+        for row in action.rows.values():
+            denominator *= lcm(*(q.denominator for r in row.rows for q in r))
+        common, largest = 1, Fraction(0)
+        for term in process.rewards[primitive]:
+            common = lcm(common, *(value.denominator for value in term.values))
+            largest += max(abs(value) for value in term.values)
+        bits = max(bits, denominator.bit_length(), (2 * common * largest).__ceil__().bit_length())
+    # two choices in one block may stand for different primitives: clear both denominators
+    return 2 * bits
