@@ -1,6 +1,12 @@
 """The model as diagrams: compile and check, regress, reach. One of the two readings of a model."""
 
-from factored_polca.symbolic.model import SymbolicAction, SymbolicModel, compile_model
+from factored_polca.symbolic.model import (
+    SymbolicAction,
+    SymbolicModel,
+    compile_condition,
+    compile_model,
+    compile_term,
+)
 from factored_polca.symbolic.order import ORDERS, two_slice_graph, variable_order
 from factored_polca.symbolic.regression import NumericView
 from factored_polca.symbolic.rows import RowDiagram, Term
@@ -12,7 +18,9 @@ __all__ = [
     "SymbolicAction",
     "SymbolicModel",
     "Term",
+    "compile_condition",
     "compile_model",
+    "compile_term",
     "two_slice_graph",
     "variable_order",
 ]

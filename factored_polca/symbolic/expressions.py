@@ -38,9 +38,13 @@ from factored_polca.models.features import Feature, position
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """Values with their positive probabilities, which sum to 1."""
+    """Values with their positive probabilities, which sum to 1.
+
+    `kinds` are the values' types: without them {true: 1} would equal {1: 1}.
+    """
 
     outcomes: tuple[tuple[Scalar, Fraction], ...]
+    kinds: tuple[type, ...]
 
 
 TableValue = Union[Scalar, Distribution, Undefined]
@@ -209,7 +213,8 @@ def _distribution(values: Sequence[Any]) -> TableValue:
         chances[key] = chances.get(key, Fraction(0)) + chance
     if total != 1:
         return Undefined(f"the probabilities sum to {describe(total)}")
-    return Distribution(tuple((value, chance) for (_, value), chance in chances.items()))
+    outcomes = tuple((value, chance) for (_, value), chance in chances.items())
+    return Distribution(outcomes, tuple(kind for kind, _ in chances))
 
 
 def row_of(feature: Feature, value: TableValue) -> tuple[Fraction, ...] | Undefined:

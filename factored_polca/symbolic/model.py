@@ -162,6 +162,37 @@ def compile_model(
     return _Build(model, names, tuple(position), manager, compiler).finish()
 
 
+def compile_condition(
+    symbolic: SymbolicModel, expression: Expression, path: tuple[str, ...], where: Diagram
+) -> Diagram:
+    """The condition `expression` over present features as a diagram with leaves 0 and 1.
+
+    Raises:
+        ModelError: where it is neither true nor false at a state in `where`.
+    """
+    build = _Build.again(symbolic)
+    result = build.condition(expression, path, where)
+    if build.faults:
+        raise ModelError(build.faults)
+    return result
+
+
+def compile_term(
+    symbolic: SymbolicModel, expression: Expression, path: tuple[str, ...], action: int, where: Diagram
+) -> Term:
+    """A reward term over x and x' under action number `action`, its expectation over x' taken.
+
+    Raises:
+        ModelError: where it is no number at a state in `where`.
+    """
+    build = _Build.again(symbolic)
+    compiled = symbolic.actions[action]
+    result = build.term(expression, path, compiled.rows, compiled.elimination, where)
+    if build.faults:
+        raise ModelError(build.faults)
+    return result
+
+
 class _Build:
     """Compiles the parts of a model and collects faults."""
 
@@ -177,6 +208,13 @@ class _Build:
         self.manager, self.compiler = manager, compiler
         self.faults: list[Fault] = []
         self.false, self.true = manager.constant(0), manager.constant(1)
+
+    @classmethod
+    def again(cls, symbolic: SymbolicModel) -> _Build:
+        """To compile further parts of a finished model."""
+        return cls(
+            symbolic.model, symbolic.order, symbolic.positions, symbolic.manager, symbolic.compiler
+        )
 
     def finish(self) -> SymbolicModel:
         terminal = self.condition(self.model.terminal, ("terminal",), self.true)

@@ -1,0 +1,57 @@
+"""How many Q-values a subtask needs: the counts of the paper's Figure 4c.
+
+    q_values          blocks times actions
+    q_applicable      the pairs (block, action) where the action is applicable, at non-terminal blocks
+    q_classes         classes of such pairs of one action with the same reward and the same row over
+                      blocks, summed over the actions
+    q_classes_shared  classes of such pairs of any actions of the subtask
+
+Two pairs in one class have the same Q-value whatever the values of the blocks.  Rows are compared
+by the fingerprint sum_k r_k T(x, k) in GF(p) with p and r drawn at random, never by floats.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+import numpy as np
+
+from factored_polca.diagrams import Diagram, Field, evaluate_states, random_prime, relabel
+from factored_polca.minimisation import Partition
+from factored_polca.minimisation.criterion import DecisionProcess, ProcessView
+from factored_polca.minimisation.quotient import feature_states
+from factored_polca.symbolic import NumericView
+
+
+@dataclass(frozen=True)
+class QValueCounts:
+    """The counts of the module's docstring."""
+
+    q_values: int
+    q_applicable: int
+    q_classes: int
+    q_classes_shared: int
+
+
+def count_q_values(process: DecisionProcess, partition: Partition, seed: int = 0) -> QValueCounts:
+    """Count the Q-values of a stable partition of `process`."""
+    symbolic = process.symbolic
+    generator = random.Random(seed)
+    field = Field(random_prime(generator))
+    view = ProcessView(process, NumericView(symbolic, field))
+    elements = field.draw(np.random.default_rng(seed), partition.blocks + 1)
+    value = relabel(partition.diagram, elements, field)
+    states, columns = feature_states(partition), symbolic.columns()
+    memo: dict[int, Diagram] = {}
+    total = by_action = 0
+    shared: set[tuple[int, int]] = set()
+    for choice in process.choices:
+        app = evaluate_states(view.app(choice), states, columns).astype(bool)
+        rows = evaluate_states(view.regress(choice, value, memo), states, columns)
+        gains = evaluate_states(view.reward(choice), states, columns)
+        classes = set(zip(rows[app].tolist(), gains[app].tolist(), strict=True))
+        total += int(app.sum())
+        by_action += len(classes)
+        shared |= classes
+    return QValueCounts(partition.blocks * len(process.choices), total, by_action, len(shared))

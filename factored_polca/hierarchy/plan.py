@@ -1,0 +1,362 @@
+"""PolCA: plan a task hierarchy bottom-up (Pineau, Gordon & Thrun 2003, section 4.2).
+
+For each subtask, children first: parameterise (`subtask`), cluster (`minimisation`), solve the
+quotient (`solvers`), and carry the policy back to the states as a diagram, which models the
+abstract action of the parents.  The result is recursively optimal: each subtask's policy is optimal
+given its children's.
+
+The polled policy takes at each state the primitive that the root's policy leads to, so its value
+under the model's reward is that of a Markov chain, computed on the quotient of the model under that
+policy.  Beside it stands the flat optimum, over all primitive actions, where its quotient is within
+a limit: the difference is what the hierarchy costs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factored_polca.diagrams import INDEX, Diagram, relabel
+from factored_polca.hierarchy.check import checked, planning_order
+from factored_polca.hierarchy.counts import QValueCounts, count_q_values
+from factored_polca.hierarchy.solved import SolvedTask
+from factored_polca.hierarchy.subtask import subtask_process
+from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
+from factored_polca.models import (
+    Fault,
+    LimitReached,
+    Model,
+    ModelError,
+    Task,
+    TaskHierarchy,
+    flat_task,
+)
+from factored_polca.solvers import METHODS, Guarantee, MDPSolution, solve_mdp
+from factored_polca.symbolic import SymbolicModel, compile_model
+
+FLAT_BLOCK_LIMIT = 100_000
+"""Blocks up to which the flat optimum is computed beside the hierarchical policy."""
+
+Progress = Callable[[str, str, int, int], None]
+"""Called with (task, stage, round, blocks)."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to plan.
+
+    `epsilon` is the gap that solvers close, relative to the largest value; `flat_block_limit` None
+    leaves the flat optimum out; `reachable` restricts every subtask to what the start can reach.
+    """
+
+    seed: int = 0
+    epsilon: float = 1e-9
+    order: str | Sequence[str] = "auto"
+    reachable: bool = False
+    block_limit: int | None = None
+    flat_block_limit: int | None = FLAT_BLOCK_LIMIT
+    memory_limit: int | None = None
+    deadline: float | None = None
+    solver: str = "auto"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The value of something at the initial belief: bounds, and how it was found."""
+
+    value: float
+    lower: float
+    upper: float
+    blocks: int
+    guarantee: Guarantee
+
+
+@dataclass(frozen=True)
+class HierarchicalPlan:
+    """A solved hierarchy.
+
+    `solved` lists the tasks children first, the root last.  `polled` is the value of the polled
+    policy under the model's own reward; `flat` the optimum without hierarchy, None where it was
+    left out, and `flat_note` says why.
+    """
+
+    symbolic: SymbolicModel
+    tasks: TaskHierarchy
+    solved: tuple[SolvedTask, ...]
+    polled: Evaluation
+    flat: Evaluation | None
+    flat_note: str
+    seconds: float
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def root(self) -> SolvedTask:
+        """The task at the top."""
+        return self.solved[-1]
+
+    @property
+    def model(self) -> Model:
+        """The model that was planned for."""
+        return self.symbolic.model
+
+    def task(self, name: str) -> SolvedTask:
+        """The solved task called `name`.
+
+        Raises:
+            KeyError: there is none; the message lists those there are.
+        """
+        for solved in self.solved:
+            if solved.task.name == name:
+                return solved
+        raise KeyError(f"no task {name!r}; there are {', '.join(s.task.name for s in self.solved)}")
+
+
+def plan(
+    model: Model,
+    tasks: TaskHierarchy | None = None,
+    options: Options | None = None,
+    *,
+    progress: Progress | None = None,
+) -> HierarchicalPlan:
+    """Plan a fully observed model with PolCA; without tasks, as one flat task.
+
+    Raises:
+        ModelError: the model or the hierarchy is not right, or a start state can't avoid a dead end.
+        LimitReached: memory, blocks or time.
+    """
+    options = options or Options()
+    began = time.perf_counter()
+    if model.observability != "full":
+        raise ModelError(
+            [
+                Fault(
+                    "planning partially observed models is not part of this version",
+                    ("observability",),
+                    'plan needs observability = "full"',
+                )
+            ]
+        )
+    if model.horizon is not None:
+        raise ModelError(
+            [Fault("a finite horizon can't be planned for", ("horizon",), "remove it, or give a discount")]
+        )
+    hierarchy = checked(model, tasks or flat_task(model))
+    symbolic = compile_model(
+        model,
+        order=options.order,
+        tasks=hierarchy,
+        memory_limit=options.memory_limit,
+        deadline=options.deadline,
+    )
+    planner = _Planner(symbolic, hierarchy, options, progress)
+    for task in planning_order(hierarchy):
+        planner.solve(task)
+    root = planner.solved[planning_order(hierarchy)[-1].name]
+    refuse_unavoidable_dead_ends(root)
+    polled = planner.polled(root)
+    flat, note = planner.flat(root)
+    warnings = tuple(w for solved in planner.solved.values() for w in solved.warnings)
+    seconds = time.perf_counter() - began
+    return HierarchicalPlan(
+        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings
+    )
+
+
+class _Planner:
+    """The working state of one call of `plan`."""
+
+    def __init__(
+        self,
+        symbolic: SymbolicModel,
+        hierarchy: TaskHierarchy,
+        options: Options,
+        progress: Progress | None,
+    ) -> None:
+        self.symbolic, self.hierarchy = symbolic, hierarchy
+        self.options, self.progress = options, progress
+        self.solved: dict[str, SolvedTask] = {}
+        self.reachable: Diagram | None = None
+        if options.reachable:
+            from factored_polca.symbolic.reach import reachable_states
+
+            names = {task.name for task in hierarchy.tasks}
+            used = {a for task in hierarchy.tasks for a in task.actions} - names
+            self.reachable = reachable_states(symbolic, sorted(used)).diagram
+
+    def tell(self, task: str, stage: str, number: int = 0, blocks: int = 0) -> None:
+        if self.progress is not None:
+            self.progress(task, stage, number, blocks)
+
+    def reduce(self, name: str, process: DecisionProcess, block_limit: int | None) -> Reduction:
+        return reduce(
+            process,
+            seed=self.options.seed,
+            block_limit=block_limit,
+            progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
+        )
+
+    def optimise(self, name: str, reduction: Reduction, method: str) -> MDPSolution:
+        self.tell(name, "solve", 0, reduction.partition.blocks)
+        solution = solve_mdp(
+            reduction.quotient.mdp,
+            method,
+            self.options.epsilon,
+            deadline=self.options.deadline,
+            describe=lambda block: describe_block(reduction, block),
+        )
+        if solution.status == "interrupted":
+            raise KeyboardInterrupt
+        if solution.status == "time limit":
+            raise LimitReached(
+                f"task {name!r}: the time limit was reached while solving "
+                f"{reduction.partition.blocks:,} blocks (gap {solution.gap:.3g})",
+                "solve",
+                solution,
+            )
+        return solution
+
+    def solve(self, task: Task) -> None:
+        """Steps 2 to 4 of PolCA for one task."""
+        began = time.perf_counter()
+        self.tell(task.name, "parameterise")
+        method = solver_of(task, self.options)
+        process = subtask_process(self.symbolic, task, self.solved, self.reachable)
+        reduction = self.reduce(task.name, process, self.options.block_limit)
+        solution = self.optimise(task.name, reduction, method)
+        counts = count_q_values(process, reduction.partition, self.options.seed)
+        policy = reduction.lift_policy(solution.policy)
+        chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
+        defined = relabel(reduction.partition.diagram, chosen, INDEX)
+        dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
+        value = expectation(reduction.project_initial(), solution.values)
+        self.solved[task.name] = SolvedTask(
+            task, reduction, solution, policy, defined, counts, value,
+            time.perf_counter() - began, dead, task_warnings(task, reduction, solution, dead),
+        )  # fmt: skip
+        self.tell(task.name, "done", 0, reduction.partition.blocks)
+
+    def polled(self, root: SolvedTask) -> Evaluation:
+        """The value of the polled policy under the model's reward."""
+        everything = tuple(range(len(self.symbolic.actions)))
+        process = root.reduction.process
+        choice = Choice("polled policy", root.defined, everything, root.policy)
+        rewards = {p: self.symbolic.actions[p].rewards for p in everything}
+        chain = DecisionProcess(self.symbolic, (choice,), process.terminal, rewards, process.reachable)
+        reduction = self.reduce("polled policy", chain, self.options.block_limit)
+        solution = self.optimise("polled policy", reduction, "auto")
+        return evaluate(reduction, solution)
+
+    def flat(self, root: SolvedTask) -> tuple[Evaluation | None, str]:
+        """The optimum over all primitive actions, or why it was left out."""
+        limit = self.options.flat_block_limit
+        if limit is None:
+            return None, "not asked for"
+        names = tuple(action.name for action in self.symbolic.actions)
+        task = root.task
+        flat_already = len(self.solved) == 1 and task.actions == names and not task.has_pseudo_reward
+        if flat_already and root.reduction.process.terminal == self.symbolic.terminal:
+            return evaluate(root.reduction, root.solution), "the plan is flat"
+        reachable = None
+        if self.options.reachable:
+            from factored_polca.symbolic.reach import reachable_states
+
+            reachable = reachable_states(self.symbolic).diagram
+        try:
+            process = flat_process(self.symbolic, reachable=reachable)
+            reduction = self.reduce("flat optimum", process, limit)
+            solution = self.optimise("flat optimum", reduction, "auto")
+        except LimitReached as error:
+            return None, f"left out: {error}"
+        return evaluate(reduction, solution), "solved over all primitive actions"
+
+
+def solver_of(task: Task, options: Options) -> str:
+    """The solver of a task.
+
+    Raises:
+        ModelError: unknown; the message lists those there are.
+    """
+    method = (task.solver or options.solver).replace("_", " ").replace("-", " ")
+    short = {"vi": "value iteration", "pi": "policy iteration", "mpi": "modified policy iteration"}
+    method = short.get(method, method)
+    if method != "auto" and method not in METHODS:
+        listed = ", ".join(["auto", *short, *METHODS])
+        raise ModelError(
+            [Fault(f"no solver {method!r} for MDPs", ("tasks", task.name, "solver"), f"there are {listed}")]
+        )
+    return method
+
+
+def expectation(belief: np.typing.NDArray[np.float64], values: np.typing.NDArray[np.float64]) -> float:
+    """sum_k b(k) V(k), where probability 0 times minus infinity is 0."""
+    inside = belief > 0
+    return float(belief[inside] @ values[inside])
+
+
+def evaluate(reduction: Reduction, solution: MDPSolution) -> Evaluation:
+    """The value of a solution at the initial belief."""
+    belief = reduction.project_initial()
+    return Evaluation(
+        expectation(belief, solution.values),
+        expectation(belief, solution.lower),
+        expectation(belief, solution.upper),
+        reduction.partition.blocks,
+        solution.guarantee,
+    )
+
+
+def describe_block(reduction: Reduction, block: int) -> str:
+    """A block by its first state."""
+    partition = reduction.partition
+    return partition.symbolic.state_text(partition.representatives[block].tolist())
+
+
+def refuse_unavoidable_dead_ends(root: SolvedTask) -> None:
+    """Raise an error if the polled policy can run into a dead end from a start state.
+
+    Raises:
+        ModelError: naming such a start.
+    """
+    belief = root.reduction.project_initial()
+    lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
+    if len(lost):
+        state = describe_block(root.reduction, int(lost[0]))
+        raise ModelError(
+            [
+                Fault(
+                    f"from a start state like {state} every policy of task {root.task.name!r} can run into "
+                    "a state that is not terminal and has no applicable action",
+                    ("tasks", root.task.name),
+                    "make such states terminal, add an action, or start elsewhere",
+                )
+            ]
+        )
+
+
+def task_warnings(task: Task, reduction: Reduction, solution: MDPSolution, dead: int) -> tuple[str, ...]:
+    """What a person should know of a solved task."""
+    found = []
+    if dead:
+        found.append(
+            f"task {task.name!r}: {dead:,} states can't avoid a state that is not terminal and has no "
+            "applicable action; its policy is undefined there"
+        )
+    if not solution.converged:
+        found.append(
+            f"task {task.name!r}: the solver stopped early ({solution.status}), gap {solution.gap:.3g}"
+        )
+    return tuple(found)
+
+
+def total_counts(solved: Mapping[str, SolvedTask] | Sequence[SolvedTask]) -> QValueCounts:
+    """The counts of all subtasks together."""
+    tasks = list(solved.values()) if isinstance(solved, Mapping) else list(solved)
+    return QValueCounts(
+        sum(task.counts.q_values for task in tasks),
+        sum(task.counts.q_applicable for task in tasks),
+        sum(task.counts.q_classes for task in tasks),
+        sum(task.counts.q_classes_shared for task in tasks),
+    )
