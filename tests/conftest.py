@@ -1,1 +1,17 @@
-"""Its presence puts this folder on the import path of every test, below it too: `import random_models`."""
+"""Shared settings of the tests; `pythonpath` in pyproject.toml makes `import random_models` work.
+
+Tests marked `data` try the program on other people's model files: they read the folder that
+FACTORED_POLCA_DATA names, and are deselected where it is not set.
+"""
+
+import os
+
+import pytest
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not os.environ.get("FACTORED_POLCA_DATA"):
+        dropped = [item for item in items if item.get_closest_marker("data")]
+        if dropped:
+            items[:] = [item for item in items if not item.get_closest_marker("data")]
+            config.hook.pytest_deselected(items=dropped)

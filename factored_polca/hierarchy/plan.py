@@ -348,7 +348,20 @@ def task_warnings(task: Task, reduction: Reduction, solution: MDPSolution, dead:
         found.append(
             f"task {task.name!r}: the solver stopped early ({solution.status}), gap {solution.gap:.3g}"
         )
+    if not task.has_pseudo_reward and len(task.actions) > 1 and equal_across_choices(reduction):
+        found.append(
+            f"task {task.name!r}: in each state its actions have equal rewards; a pseudo_reward would tell "
+            "it what to aim for"
+        )
     return tuple(found)
+
+
+def equal_across_choices(reduction: Reduction) -> bool:
+    """Whether in each block all applicable choices have the same reward."""
+    mdp = reduction.quotient.mdp
+    high = np.where(mdp.applicable, mdp.rewards, -np.inf).max(axis=0, initial=-np.inf)
+    low = np.where(mdp.applicable, mdp.rewards, np.inf).min(axis=0, initial=np.inf)
+    return bool((high <= low).all())
 
 
 def total_counts(solved: Mapping[str, SolvedTask] | Sequence[SolvedTask]) -> QValueCounts:

@@ -63,6 +63,8 @@ def describe(value: Scalar | Undefined) -> str:
         return f"undefined ({value.reason})"
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, Fraction) and max(abs(value.numerator), value.denominator) >= 10**40:
+        return "a number of more than 40 digits"
     return str(value)
 
 
@@ -169,7 +171,7 @@ def _logic(name: str, values: Iterable[Scalar | Undefined]) -> bool | Undefined:
         if isinstance(value, Undefined):
             return value
         if not isinstance(value, bool):
-            return Undefined(f"'{name}' needs truth values, not {_kind(value)} ({value})")
+            return Undefined(f"'{name}' needs truth values, not {_kind(value)} ({describe(value)})")
         if name == "not":
             return not value
         if value is decides:
@@ -193,11 +195,13 @@ def apply_operator(name: str, values: Iterable[Scalar | Undefined]) -> Scalar | 
     if row.kind == "equality":
         a, b = arguments
         if type(a) is not type(b):
-            return Undefined(f"'{row.symbol}' compares {_kind(a)} ({a}) with {_kind(b)} ({b})")
+            left, right = f"{_kind(a)} ({describe(a)})", f"{_kind(b)} ({describe(b)})"
+            return Undefined(f"'{row.symbol}' compares {left} with {right}")
     else:
         for value in arguments:
             if not isinstance(value, Fraction):
-                return Undefined(f"'{row.symbol}' needs numbers, not {_kind(value)} ({value})")
+                shown = f"{_kind(value)} ({describe(value)})"
+                return Undefined(f"'{row.symbol}' needs numbers, not {shown}")
     function = row.function
     assert function is not None
     result: Scalar | Undefined
@@ -586,13 +590,21 @@ def references(*roots: Expression) -> set[Reference]:
 
 
 def rewrite(expression: Expression, leaf: Callable[[Expression], Expression]) -> Expression:
-    """`expression` with `leaf` applied to each reference, parameter and constant."""
+    """`expression` with `leaf` applied to each reference, parameter and constant.
+
+    Parts in which nothing changes stay the same objects, and nothing is flattened anew: a shared
+    part is visited once, however often it occurs.
+    """
     new: dict[Expression, Expression] = {}
     for e in parts_first(expression):
+        parts = children(e)
+        if parts and all(new[part] is part for part in parts):
+            new[e] = e
+            continue
         result: Expression
         match e:
             case Operation():
-                result = operation(e.operator, *(new[a] for a in e.arguments))
+                result = Operation(e.operator, tuple(new[a] for a in e.arguments))
             case Conditional():
                 result = Conditional(new[e.condition], new[e.then], new[e.otherwise])
             case Switch():

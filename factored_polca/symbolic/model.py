@@ -47,6 +47,7 @@ class SymbolicAction:
 
     `rows` maps changed features to their row diagrams; `elimination` lists all features, children of
     synchronic arcs before their parents; `app` is where the action is applicable and x not terminal.
+    `rewards` are expectations over x'; `sampled_rewards` the same terms as functions of (x, x').
     """
 
     name: str
@@ -54,6 +55,7 @@ class SymbolicAction:
     elimination: tuple[int, ...]
     app: Diagram
     rewards: tuple[Term, ...]
+    sampled_rewards: tuple[Term, ...]
 
     @property
     def synchronic(self) -> bool:
@@ -274,12 +276,10 @@ class _Build:
         terms: list[tuple[Expression, tuple[str, ...]]]
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
         terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
-        rewards = tuple(
-            self.term(expression, where, rows, elimination, app)
-            for expression, where in terms
-            if expression != ZERO
-        )
-        return SymbolicAction(action.name, rows, elimination, app, rewards)
+        terms = [(expression, where) for expression, where in terms if expression != ZERO]
+        sampled = tuple(self.sampled_term(expression, where, app) for expression, where in terms)
+        rewards = tuple(self.expected(term, rows, elimination) for term in sampled)
+        return SymbolicAction(action.name, rows, elimination, app, rewards, sampled)
 
     def rows(
         self, index: int, compiled: Diagram, effect: Expression, path: tuple[str, ...], where: Diagram
@@ -336,15 +336,22 @@ class _Build:
         elimination: tuple[int, ...],
         where: Diagram,
     ) -> Term:
+        """A reward term with its expectation over x' taken."""
+        return self.expected(self.sampled_term(expression, path, where), rows, elimination)
+
+    def sampled_term(self, expression: Expression, path: tuple[str, ...], where: Diagram) -> Term:
+        """A reward term as a function of (x, x'); a condition counts as 0 or 1."""
         compiled = self.compiler.compile(expression)
-        bad = np.array([not isinstance(v, Fraction) for v in self.compiler.table.values], dtype=np.uint64)
-        for entry in range(len(bad)):
-            if bad[entry] and isinstance(self.compiler.value(entry), bool):
-                bad[entry] = 0  # a condition counts as 0 or 1
+        bad = np.array(
+            [not isinstance(v, (Fraction, bool)) for v in self.compiler.table.values], dtype=np.uint64
+        )
         wrong = relabel(compiled, bad, INDEX) & where
         if wrong != self.false:
             self.report(compiled, wrong, path, "the reward", "a number")
-        term = numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+        return numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+
+    def expected(self, term: Term, rows: dict[int, RowDiagram], elimination: tuple[int, ...]) -> Term:
+        """The expectation over x' of a term."""
         for index in elimination:
             level = 2 * self.positions[index] + 1
             if level in support(term.diagram):

@@ -1,0 +1,160 @@
+"""Model files: which format a file has, reading it, and writing it so that no half-written file stays.
+
+The extension decides, in any case of letters.  `FORMATS` is the table; a format that can't hold
+all of a document refuses it and says why.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from factored_polca.formats.document import Document
+from factored_polca.formats.native import read_native, write_native
+from factored_polca.models.errors import Fault, ModelError
+from factored_polca.models.model import Model
+from factored_polca.models.tasks import TaskHierarchy
+
+MAXIMUM_BYTES: Final = 64 * 2**20
+"""Larger files are refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A file format: `read(text, overrides, name)` gives a document, `write(document)` a text."""
+
+    name: str
+    read: Callable[[str, Mapping[str, str], str], Document]
+    write: Callable[[Document], str]
+
+
+def _read_native(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    return read_native(text, overrides, name=name)
+
+
+def _write_native(document: Document) -> str:
+    return write_native(document.model, document.tasks)
+
+
+def _read_spudd(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    if overrides:
+        listed = ", ".join(overrides)
+        raise ModelError(f"SPUDD's format has no parameters to set ({listed}): edit the file")
+    from factored_polca.formats.spudd import read_spudd_with_warnings
+
+    model, warnings = read_spudd_with_warnings(text, name)
+    return Document(model, None, tuple(warnings))
+
+
+def _write_spudd(document: Document) -> str:
+    if document.tasks is not None:
+        raise ModelError("SPUDD's format can't hold tasks: write a .toml file, or leave the tasks out")
+    from factored_polca.formats.spudd import write_spudd
+
+    return write_spudd(document.model)
+
+
+_NATIVE: Final = Format("native", _read_native, _write_native)
+_SPUDD: Final = Format("SPUDD", _read_spudd, _write_spudd)
+
+FORMATS: Final[Mapping[str, Format]] = {".toml": _NATIVE, ".dat": _SPUDD, ".spudd": _SPUDD}
+
+
+def format_of(path: str | Path) -> Format:
+    """The format that the extension of `path` stands for.
+
+    Raises:
+        ModelError: none; the message lists those there are.
+    """
+    extension = Path(path).suffix
+    if extension.lower() in FORMATS:
+        return FORMATS[extension.lower()]
+    listed = ", ".join(f"{key} ({value.name})" for key, value in FORMATS.items())
+    found = f"the extension {extension!r} is" if extension else "a file without an extension has"
+    raise ModelError(
+        [Fault(f"{found} no known format", hint=f"known extensions are {listed}", file=str(path))]
+    )
+
+
+def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Document:
+    """The model in the file `path`, with its tasks if it has any.
+
+    `overrides` gives parameters of the model other values, as texts such as "1/3".
+
+    Raises:
+        ModelError: no such file, no known format, or a text at fault; names file, line and column.
+    """
+    chosen = format_of(path)
+    try:
+        document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    return replace(document, warnings=ModelError(document.warnings).in_file(str(path)).faults)
+
+
+def _text(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAXIMUM_BYTES + 1)
+    except FileNotFoundError:
+        listed = ", ".join(FORMATS)
+        raise ModelError([Fault("there is no such file", hint=f"formats are {listed}")]) from None
+    except (OSError, ValueError) as error:
+        raise ModelError(f"the file can't be read: {_reason(error)}") from None
+    if len(data) > MAXIMUM_BYTES:
+        raise ModelError(f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        before = data[: error.start]
+        line = before.count(b"\n") + 1
+        column = len(before[before.rfind(b"\n") + 1 :].decode("utf-8", "replace")) + 1
+        message = f"the byte {data[error.start]:#04x} is no UTF-8"
+        hint = "save the file in the encoding UTF-8"
+        raise ModelError([Fault(message, hint=hint, line=line, column=column)]) from None
+
+
+def _reason(error: Exception) -> str:
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+
+
+def write(document: Document | Model, path: str | Path, tasks: TaskHierarchy | None = None) -> None:
+    """Writes a model, and its tasks if there are any, in the format of the extension of `path`.
+
+    The file appears whole or not at all; one that is already there stays as it is until then.
+
+    Raises:
+        ModelError: no known format, something the format can't express, or a folder that can't be
+            written to.
+    """
+    if isinstance(document, Model):
+        document = Document(document, tasks)
+    elif tasks is not None:
+        document = Document(document.model, tasks, document.warnings)
+    try:
+        text = format_of(path).write(document)
+        _replace(Path(os.path.realpath(path)), text.encode("utf-8"))
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    except OSError as error:
+        raise ModelError([Fault(f"can't be written: {_reason(error)}", file=str(path))]) from None
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Puts `data` where `path` is, by way of a new file in the same folder."""
+    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.part")
+    try:
+        with temporary.open("xb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if path.exists():
+            temporary.chmod(path.stat().st_mode & 0o777)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,76 @@
+"""A plan as what execution needs: for each task a partition and the choice in each block.
+
+The path from a state to a primitive action is polled from the top: the root's partition gives the
+block, the block its choice; if that is a child, the child is asked in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams import Diagram
+from factored_polca.hierarchy.plan import HierarchicalPlan
+from factored_polca.minimisation import Partition
+from factored_polca.models import Model, TaskHierarchy
+from factored_polca.symbolic import SymbolicModel
+
+
+@dataclass(frozen=True)
+class TaskPolicy:
+    """The policy of one task over the blocks of its partition.
+
+    `choice[b]` is the number of the chosen one of `actions`, -1 where there is none (the task has
+    ended, or can't avoid a dead end); `terminal[b]` says whether it has ended.
+    """
+
+    name: str
+    actions: tuple[str, ...]
+    partition: Partition
+    choice: npt.NDArray[np.int32]
+    values: npt.NDArray[np.float64]
+    terminal: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ExecutablePlan:
+    """A hierarchical policy that can be executed, saved and loaded.
+
+    `policy` maps each state to the number of the model's action that is taken, or to the number of
+    actions where there is none.  `report` is what `plan --json` prints.
+    """
+
+    symbolic: SymbolicModel
+    tasks: TaskHierarchy
+    root: str
+    policies: Mapping[str, TaskPolicy]
+    policy: Diagram
+    report: Mapping[str, Any]
+
+    @property
+    def model(self) -> Model:
+        """The model that was planned for."""
+        return self.symbolic.model
+
+
+def executable(plan: HierarchicalPlan, report: Mapping[str, Any] | None = None) -> ExecutablePlan:
+    """What execution needs of a plan."""
+    policies = {
+        solved.task.name: TaskPolicy(
+            solved.task.name,
+            solved.task.actions,
+            solved.reduction.partition,
+            solved.solution.policy.astype(np.int32),
+            solved.solution.values,
+            solved.reduction.quotient.mdp.terminal,
+        )
+        for solved in plan.solved
+    }
+    root = plan.root
+    return ExecutablePlan(
+        plan.symbolic, plan.tasks, root.task.name, policies, root.policy, dict(report or {})
+    )
