@@ -285,7 +285,7 @@ def test_what_is_written_is_read_back(first: int) -> None:
         assert back.warnings == ()
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_random_hierarchical_models_are_read_back(seed: int) -> None:
     model = random_model(seed, parameters=seed % 2 == 0)
     tasks = random_tasks(seed, model)
@@ -659,7 +659,7 @@ def test_no_mutation_of_a_sound_file_raises_anything_but_a_model_error() -> None
     sources = [template("t")]
     sources += [write_native(d.model, d.tasks) for d in map(random_document, range(1000, 1006))]
     sound = 0
-    for _ in range(1000):
+    for _ in range(700):
         text = rng.choice(sources)
         for _ in range(rng.randint(1, 3)):
             i, j = sorted(rng.randrange(len(text) + 1) for _ in range(2))
@@ -667,7 +667,7 @@ def test_no_mutation_of_a_sound_file_raises_anything_but_a_model_error() -> None
             new = rng.choice(["", text[j : j + 20], rng.choice("[]{}()=\"'\\\n,.0x#é\x00"), text[i:j] * 2])
             text = text[:i] + new + text[j:]
         sound += only_model_errors(text)
-    assert 100 < sound < 900, "the mutations neither break all nor none"
+    assert 40 < sound < 600, "the mutations neither break all nor none"
 
 
 KEYS = ["x", "a", "values", "null", "effects", "senses", "reward", "actions", "terminal"]

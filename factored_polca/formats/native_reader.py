@@ -87,6 +87,7 @@ class _Reader:
         self.places: dict[Path, Path] = {}  # where `check` says something is -> where it is in the text
         self.failed: set[Path] = set()
         self.expressions: dict[Path, Expression] = {}
+        self.parsed: dict[str, Expression] = {}
         self.scope = Scope()
         self.values_left = MAXIMUM_VALUES_IN_ALL
 
@@ -208,7 +209,7 @@ class _Reader:
         if shown and shown != path:
             self.places.setdefault(shown, path)
         try:
-            result = _expression(value, self.scope if scope is None else scope)
+            result = self.read(value) if scope is None else _expression(value, scope)
         except ModelError as error:
             self.failed.add(path)
             text = value if isinstance(value, str) else None
@@ -222,6 +223,14 @@ class _Reader:
             return FALSE
         self.expressions[path] = result
         return result
+
+    def read(self, value: Any) -> Expression:
+        """The expression in the model's scope; actions often repeat a text, which is read once."""
+        if not isinstance(value, str):
+            return _expression(value, self.scope)
+        if value not in self.parsed:
+            self.parsed[value] = _expression(value, self.scope)
+        return self.parsed[value]
 
     def table_of_expressions(self, path: Path, value: Any) -> list[tuple[str, Expression]]:
         table = self.table(path, value)

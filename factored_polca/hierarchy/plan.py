@@ -357,10 +357,13 @@ def task_warnings(task: Task, reduction: Reduction, solution: MDPSolution, dead:
 
 
 def equal_across_choices(reduction: Reduction) -> bool:
-    """Whether in each block all applicable choices have the same reward."""
+    """Whether several choices, wherever they are applicable in one block, have one reward."""
     mdp = reduction.quotient.mdp
-    high = np.where(mdp.applicable, mdp.rewards, -np.inf).max(axis=0, initial=-np.inf)
-    low = np.where(mdp.applicable, mdp.rewards, np.inf).min(axis=0, initial=np.inf)
+    several = mdp.applicable.sum(axis=0) > 1
+    if not several.any():
+        return False
+    high = np.where(mdp.applicable, mdp.rewards, -np.inf)[:, several].max(axis=0)
+    low = np.where(mdp.applicable, mdp.rewards, np.inf)[:, several].min(axis=0)
     return bool((high <= low).all())
 
 

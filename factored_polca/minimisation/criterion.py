@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from math import lcm, prod
 
 from factored_polca.diagrams import Diagram, choose, leaves
 from factored_polca.symbolic import NumericView, SymbolicModel, Term
@@ -128,3 +130,27 @@ def policy_primitives(policy: Diagram, defined: Diagram, count: int) -> tuple[in
     manager = policy.manager
     masked = choose(defined, policy, manager.constant(count))
     return tuple(sorted(int(leaf) for leaf in leaves(masked) if int(leaf) < count))
+
+
+def row_denominator(process: DecisionProcess, primitive: int) -> int:
+    """The product over features of their rows' denominators: it makes T_p(x, x') an integer everywhere."""
+    rows = process.symbolic.actions[primitive].rows.values()
+    return prod(lcm(*(q.denominator for row in r.rows for q in row)) for r in rows)
+
+
+def reward_denominator(process: DecisionProcess, primitive: int) -> int:
+    """A common multiple of the denominators of the reward terms of a primitive."""
+    return lcm(*(value.denominator for term in process.rewards[primitive] for value in term.values))
+
+
+def largest_reward(process: DecisionProcess, primitive: int) -> Fraction:
+    """A bound on |R_p(x)|: the largest absolute values of the terms, added up."""
+    terms = process.rewards[primitive]
+    return sum((max(abs(value) for value in term.values) for term in terms), Fraction(0))
+
+
+def common_denominator(process: DecisionProcess) -> int:
+    """A multiple of every denominator of a probability or reward that the process uses."""
+    primitives = {p for choice in process.choices for p in choice.primitives}
+    used = [f(process, p) for p in sorted(primitives) for f in (row_denominator, reward_denominator)]
+    return lcm(*used)

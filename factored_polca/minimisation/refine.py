@@ -33,13 +33,12 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
-from math import lcm
 
 import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import (
+    MERSENNE_61,
     Aborted,
     Diagram,
     Field,
@@ -49,7 +48,14 @@ from factored_polca.diagrams import (
     relabel,
 )
 from factored_polca.diagrams.operations import leaf_payloads
-from factored_polca.minimisation.criterion import DecisionProcess, ProcessView
+from factored_polca.minimisation.criterion import (
+    DecisionProcess,
+    ProcessView,
+    common_denominator,
+    largest_reward,
+    reward_denominator,
+    row_denominator,
+)
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
@@ -108,7 +114,8 @@ def minimise(
         block_limit: stop beyond so many blocks.
 
     Raises:
-        LimitReached: blocks, memory or time; `partial` is the partition so far.
+        LimitReached: blocks, memory or time; `partial` is the partition so far (None if even numbering
+            its blocks takes more memory than there is).
     """
     refinement = _Refinement(process, seed, block_limit, progress)
     start = time.perf_counter()
@@ -117,9 +124,9 @@ def minimise(
     except (MemoryLimit, Aborted) as error:
         raise LimitReached(
             f"minimisation stopped in round {refinement.rounds + 1} at "
-            f"{refinement.labels.blocks:,} blocks: {error}",
+            f"{refinement.blocks:,} blocks: {error}",
             "minimisation",
-            refinement.partition(),
+            refinement.partition_so_far(),
         ) from None
     bound = refinement.bound() ** confirmations
     seconds = time.perf_counter() - start
@@ -143,7 +150,15 @@ class _Refinement:
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.previous: dict[int, Diagram] = {}
-        self.use(Field())
+        self.denominator = common_denominator(process)
+        self.use(Field() if self.denominator % MERSENNE_61 else Field(self.fresh_prime()))
+
+    @property
+    def blocks(self) -> int:
+        """The blocks so far; the class of states outside a restriction is none."""
+        reachable = self.process.reachable
+        has_outside = reachable is not None and not reachable.is_constant
+        return max(1, self.labels.blocks - has_outside)
 
     def use(self, field: Field) -> None:
         """Go on in another field, with fresh draws; start from the present partition."""
@@ -171,20 +186,8 @@ class _Refinement:
         """A random prime not used yet that divides no denominator of the model."""
         while True:
             prime = random_prime(self.random)
-            if prime not in self.primes and self.denominators() % prime:
+            if prime not in self.primes and self.denominator % prime:
                 return prime
-
-    def denominators(self) -> int:
-        """A common multiple of all denominators."""
-        common = 1
-        for choice in self.process.choices:
-            for primitive in choice.primitives:
-                action = self.process.symbolic.actions[primitive]
-                for row in action.rows.values():
-                    common = lcm(common, *(q.denominator for r in row.rows for q in r))
-                for term in self.process.rewards[primitive]:
-                    common = lcm(common, *(value.denominator for value in term.values))
-        return common
 
     def begin(self) -> None:
         """Separate by reachability, terminal flag, applicable choices and rewards."""
@@ -216,7 +219,7 @@ class _Refinement:
             self.split(regressed)
         self.rounds += 1
         if self.progress is not None:
-            self.progress(self.rounds, self.labels.blocks)
+            self.progress(self.rounds, self.blocks)
         return self.labels.blocks > before
 
     def split(self, by: Diagram) -> None:
@@ -234,7 +237,7 @@ class _Refinement:
         fresh[first] = False
         elements[fresh] = self.draw_new(int(fresh.sum()), elements[first])
         self.labels = _Labels(numbered, elements)
-        if self.block_limit is not None and self.labels.blocks > self.block_limit:
+        if self.block_limit is not None and self.blocks > self.block_limit:
             raise LimitReached(
                 f"more than {self.block_limit:,} blocks after {self.rounds} rounds",
                 "minimisation",
@@ -253,27 +256,36 @@ class _Refinement:
         reachable = self.process.reachable
         return partition_from(self.process.symbolic, self.labels.diagram, reachable)
 
+    def partition_so_far(self) -> Partition | None:
+        """The partition when a limit has been reached; None where even that takes more memory."""
+        deadline, self.manager.deadline = self.manager.deadline, None
+        try:
+            self.previous.clear()
+            self.manager.collect_garbage()
+            return self.partition()
+        except MemoryLimit:
+            return None
+        finally:
+            self.manager.deadline = deadline
+
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
         return difference_bits(self.process) / 60 / PRIMES_IN_RANGE + 2.0 / 2**60
 
 
 def difference_bits(process: DecisionProcess) -> int:
-    """Bits of the largest cleared numerator of a difference of two rows or rewards.
+    """Bits of the largest cleared numerator of a difference of two entries of rows, or of two rewards.
 
-    An entry of a row of action a is n / D with 0 <= n <= D = prod_i lcm(denominators of feature i's
-    rows), since entries of one row sum to 1; rewards are bounded term by term.
+    An entry of a row of primitive p is n / D_p with 0 <= n <= D_p, a reward n / C_p with |n| <= N_p.  In
+    one block a choice may stand for different primitives p, q, so both denominators are cleared:
+    |n_x D_q - n_y D_p| <= D_p D_q, and |n_x C_q - n_y C_p| <= N_p C_q + N_q C_p.
     """
     bits = 1
     for primitive in {p for choice in process.choices for p in choice.primitives}:
-        action = process.symbolic.actions[primitive]
-        denominator = 1
-        for row in action.rows.values():
-            denominator *= lcm(*(q.denominator for r in row.rows for q in r))
-        common, largest = 1, Fraction(0)
-        for term in process.rewards[primitive]:
-            common = lcm(common, *(value.denominator for value in term.values))
-            largest += max(abs(value) for value in term.values)
-        bits = max(bits, denominator.bit_length(), (2 * common * largest).__ceil__().bit_length())
-    # two choices in one block may stand for different primitives: clear both denominators
-    return 2 * bits
+        common = reward_denominator(process, primitive)
+        numerator = int(common * largest_reward(process, primitive))
+        bits = max(
+            bits, row_denominator(process, primitive).bit_length(), common.bit_length(),
+            numerator.bit_length(),
+        )  # fmt: skip
+    return 2 * bits + 1

@@ -41,6 +41,7 @@ def compile_initial(build: _Build) -> dict[int, RowDiagram]:
         rows[numbers[name]] = build.rows(
             numbers[name], build.compiler.compile(moved), moved, ("initial", name), build.true
         )
+    build.settle_suspects(rows)
     if model.initial.factors:
         rows.update(_conditioned(build, rows))
     for index, feature in enumerate(model.features):
@@ -71,7 +72,8 @@ def _conditioned(build: _Build, rows: dict[int, RowDiagram]) -> dict[int, RowDia
         compiled = build.compiler.compile(primed(factor))
         table = build.compiler.table.values
         bad = np.array([not isinstance(v, (Fraction, bool)) or v < 0 for v in table], dtype=np.uint64)
-        wrong = relabel(compiled, bad, INDEX)
+        counts = np.array([value != 0 for value in product.values], dtype=np.uint64)
+        wrong = relabel(compiled, bad, INDEX) & relabel(product.diagram, counts, INDEX)
         if wrong != build.false:
             build.report(
                 compiled, wrong, ("initial", "factors", str(number)), "the factor", "a number >= 0"

@@ -8,7 +8,8 @@ are diagrams over x of exact rationals, expectations over x' taken:
     R_a(x) = sum over terms r of E[r(x, x') | x, a].
 
 Where a is not applicable (app_a = applicable and not terminal) rows and rewards mean nothing, so
-faults count only where app_a holds; elsewhere undefined entries are replaced by harmless ones.
+faults count only where app_a holds, and there only in contexts of positive probability; elsewhere
+undefined entries are replaced by harmless ones.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from factored_polca.models.expressions import ZERO, Expression, Reference, Undef
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, row_of, used
 from factored_polca.symbolic.initial import compile_initial
 from factored_polca.symbolic.order import variable_order
-from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, numbered
+from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, numbered, possible
 
 
 @dataclass(frozen=True)
@@ -209,6 +210,7 @@ class _Build:
         self.model, self.order, self.positions = model, order, positions
         self.manager, self.compiler = manager, compiler
         self.faults: list[Fault] = []
+        self.suspects: list[tuple[Feature, Diagram, Diagram, tuple[str, ...]]] = []
         self.false, self.true = manager.constant(0), manager.constant(1)
 
     @classmethod
@@ -272,6 +274,7 @@ class _Build:
             rows[numbers[name]] = self.rows(
                 numbers[name], self.compiler.compile(effect), effect, (*path, "effects", name), app
             )
+        self.settle_suspects(rows)
         elimination = self.elimination(rows)
         terms: list[tuple[Expression, tuple[str, ...]]]
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
@@ -284,6 +287,7 @@ class _Build:
     def rows(
         self, index: int, compiled: Diagram, effect: Expression, path: tuple[str, ...], where: Diagram
     ) -> RowDiagram:
+        """The row diagram of an effect; where it is none it becomes a suspect: see `settle_suspects`."""
         feature = self.model.features[index]
         fallback = tuple(Fraction(int(v == 0)) for v in range(len(feature.values)))
         numbers: dict[Row, int] = {}
@@ -298,10 +302,39 @@ class _Build:
         if bad.any():
             wrong = relabel(compiled, bad, INDEX) & where
             if wrong != self.false:
-                self.report_row(feature, compiled, wrong, path)
+                self.suspects.append((feature, compiled, wrong, path))
         primed = {r.name for r in references(effect) if r.primed}
         parents = tuple(i for i, f in enumerate(self.model.features) if f.name in primed)
         return RowDiagram(index, relabel(compiled, images, INDEX), tuple(numbers), parents)
+
+    def settle_suspects(self, rows: dict[int, RowDiagram]) -> None:
+        """Report the rows that are wrong where next values of positive probability lead."""
+        for feature, compiled, wrong, path in self.suspects:
+            happens = self.happening(wrong, rows)
+            if happens != self.false:
+                self.report_row(feature, compiled, happens, path)
+        self.suspects.clear()
+
+    def happening(self, condition: Diagram, rows: dict[int, RowDiagram]) -> Diagram:
+        """The part of a condition over (x, x') where the next values that it tests are possible."""
+        at = {2 * position + 1: index for index, position in enumerate(self.positions)}
+        waiting = [at[level] for level in support(condition) if level in at]
+        seen: set[int] = set()
+        while waiting:
+            index = waiting.pop()
+            if index in seen:
+                continue
+            seen.add(index)
+            level = 2 * self.positions[index] + 1
+            if index in rows:
+                condition = condition & possible(rows[index], level)
+                waiting += rows[index].parents_next
+            else:
+                for value in range(len(self.model.features[index].values)):
+                    now = self.manager.indicator(level - 1, [value])
+                    following = self.manager.indicator(level, [value])
+                    condition = condition & ~(now ^ following)
+        return condition
 
     def report_row(
         self, feature: Feature, compiled: Diagram, wrong: Diagram, path: tuple[str, ...]
@@ -345,7 +378,7 @@ class _Build:
         bad = np.array(
             [not isinstance(v, (Fraction, bool)) for v in self.compiler.table.values], dtype=np.uint64
         )
-        wrong = relabel(compiled, bad, INDEX) & where
+        wrong = self.happening(relabel(compiled, bad, INDEX) & where, rows)
         if wrong != self.false:
             self.report(compiled, wrong, path, "the reward", "a number")
         return numbered(compiled, lambda n: as_number(self.compiler.value(n)))

@@ -21,10 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
-import numpy as np
-
 from factored_polca.diagrams import (
-    INDEX,
     Diagram,
     apply,
     choose,
@@ -32,14 +29,13 @@ from factored_polca.diagrams import (
     leaves,
     move,
     node_count,
-    relabel,
     states_of_leaves,
     sum_out,
     support,
 )
 from factored_polca.symbolic.boolean_sets import BooleanSets
 from factored_polca.symbolic.model import SymbolicAction, SymbolicModel
-from factored_polca.symbolic.rows import RowDiagram
+from factored_polca.symbolic.rows import possible
 
 Backend: TypeAlias = Literal["dd", "kernel"]
 
@@ -117,20 +113,9 @@ def initial_support(symbolic: SymbolicModel) -> Diagram:
     """The set of states to which the initial belief gives a positive probability."""
     result = symbolic.manager.constant(1)
     for feature in sorted(symbolic.initial, key=symbolic.now, reverse=True):
-        result = result & possible(symbolic, symbolic.initial[feature])
+        result = result & possible(symbolic.initial[feature], symbolic.next(feature))
     count = len(symbolic.order)
     return move(result, {2 * place + 1: 2 * place for place in range(count)})
-
-
-def possible(symbolic: SymbolicModel, row: RowDiagram) -> Diagram:
-    """The condition P(x_i' | parents) > 0 over x_i' and the parents."""
-    manager, level = symbolic.manager, symbolic.next(row.feature)
-    result = manager.constant(0)
-    for value in range(len(row.rows[0])):
-        positive = np.array([r[value] > 0 for r in row.rows], dtype=np.uint64)
-        here = relabel(row.diagram, positive, INDEX)
-        result = choose(manager.indicator(level, [value]), here, result)
-    return result
 
 
 def transition_relation(symbolic: SymbolicModel, action: SymbolicAction) -> TransitionRelation:
@@ -139,7 +124,7 @@ def transition_relation(symbolic: SymbolicModel, action: SymbolicAction) -> Tran
     joined: list[tuple[Diagram, tuple[int, ...]]] = []
     for feature in changed:
         row = action.rows[feature]
-        conjunct = possible(symbolic, row)
+        conjunct = possible(row, symbolic.next(feature))
         for parent in row.parents_next:
             if parent not in action.rows:
                 conjunct = _persisting(symbolic, conjunct, parent)
@@ -204,7 +189,7 @@ class _KernelSets:
     """Sets as diagrams with leaves 0 and 1."""
 
     def __init__(self, relations: Sequence[TransitionRelation]) -> None:
-        self.images = [self._image(relation) for relation in relations]
+        self.images: Sequence[Callable[[Any], Any]] = [self._image(relation) for relation in relations]
 
     @staticmethod
     def _image(relation: TransitionRelation) -> Callable[[Diagram], Diagram]:
@@ -244,7 +229,7 @@ class _LibrarySets:
     ) -> None:
         self.sets = sets
         self.valid_now = sets.valid(symbolic.now_levels)
-        self.images = [self._image(relation) for relation in relations]
+        self.images: Sequence[Callable[[Any], Any]] = [self._image(relation) for relation in relations]
 
     def _image(self, relation: TransitionRelation) -> Callable[[Any], Any]:
         sets = self.sets

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from factored_polca.diagrams import INDEX, Diagram, leaves, relabel
+from factored_polca.diagrams import INDEX, Diagram, choose, leaves, relabel
 
 Row = tuple[Fraction, ...]
 """The probability of each value of a feature."""
@@ -48,3 +48,14 @@ def numbered(diagram: Diagram, value: Callable[[int], Any]) -> Term:
     for entry in entries:
         images[entry] = found.setdefault(value(entry), len(found))
     return Term(relabel(diagram, images, INDEX), tuple(found))
+
+
+def possible(row: RowDiagram, level: int) -> Diagram:
+    """The condition P(x_i' | parents) > 0 over x_i', which stands at `level`, and the parents."""
+    manager = row.diagram.manager
+    result = manager.constant(0)
+    for value in range(len(row.rows[0])):
+        positive = np.array([r[value] > 0 for r in row.rows], dtype=np.uint64)
+        here = relabel(row.diagram, positive, INDEX)
+        result = choose(manager.indicator(level, [value]), here, result)
+    return result

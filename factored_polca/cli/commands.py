@@ -1,0 +1,302 @@
+"""The commands that plan and execute: minimise, plan, act, simulate."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import time
+from typing import Any
+
+from rich.markup import escape
+
+from factored_polca.cli.output import Output, big, make_table, seconds
+from factored_polca.cli.source import Source, load, parse_memory, parse_state
+
+STARTED = time.perf_counter()
+
+
+def peak_memory_bytes() -> int:
+    """The largest resident set of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def current_memory_bytes() -> int:
+    """The resident set now, or its peak where the system does not say."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        return peak_memory_bytes()
+
+
+def compile_kernels(output: Output, solver: bool) -> float:
+    """Compile or load the numeric kernels; say so where it takes long."""
+    from factored_polca.hierarchy.warm import is_compiled, warm_up
+
+    if is_compiled():
+        return warm_up(solver)
+    with output.progress("compiling numeric kernels, once for this installation (some 10 seconds)"):
+        return warm_up(solver)
+
+
+def limits(arguments: argparse.Namespace) -> tuple[int | None, float | None]:
+    """The bytes the diagrams may take, and the time at which to stop."""
+    memory = None
+    if arguments.memory is not None:
+        memory = max(32 << 20, parse_memory(arguments.memory) - current_memory_bytes())
+    deadline = None if arguments.time is None else time.monotonic() + arguments.time
+    return memory, deadline
+
+
+def report_warnings(source: Source, output: Output) -> None:
+    """Print what reading the model found worth a warning."""
+    for warning in source.warnings:
+        output.warn(str(warning))
+
+
+def minimise(arguments: argparse.Namespace, output: Output) -> int:
+    """Minimise a model, print the figures."""
+    from factored_polca.minimisation import flat_process
+    from factored_polca.minimisation import minimise as minimise_process
+    from factored_polca.symbolic import compile_model
+    from factored_polca.symbolic.reach import reachable_states
+
+    source = load(arguments.model, arguments.set)
+    report_warnings(source, output)
+    compile_seconds = compile_kernels(output, solver=False)
+    memory, deadline = limits(arguments)
+    actions = None if arguments.actions is None else [a.strip() for a in arguments.actions.split(",")]
+    data: dict[str, Any] = {"model": source.model.name, "states": source.model.states}
+    began = time.perf_counter()
+    with output.progress(f"minimising {source.name}"):
+        symbolic = compile_model(
+            source.model, order=arguments.order, memory_limit=memory, deadline=deadline
+        )
+        reachable = None
+        if arguments.reachable:
+            found = reachable_states(symbolic, actions)
+            reachable = found.diagram
+            data["reachable_states"] = found.states
+        process = flat_process(symbolic, actions, reachable)
+        result = minimise_process(
+            process,
+            seed=arguments.seed,
+            progress=lambda number, blocks: output.update(
+                f"minimising {source.name}: round {number}, {blocks:,} blocks"
+            ),
+        )
+    elapsed = time.perf_counter() - began
+    peak_nodes, _ = symbolic.manager.peaks()
+    data |= {
+        "blocks": result.partition.blocks,
+        "rounds": result.rounds,
+        "nodes": result.partition.nodes,
+        "peak_nodes": peak_nodes,
+        "collision_bound": result.collision_bound,
+        "order": list(symbolic.order),
+        "seconds": elapsed,
+        "parse_seconds": source.parse_seconds,
+        "compile_seconds": compile_seconds,
+    }
+    status = 0
+    if arguments.certify:
+        from factored_polca.minimisation.certify import certify
+
+        with output.progress(f"certifying {result.partition.blocks:,} blocks"):
+            certificate = certify(process, result.partition)
+        data["certified"] = certificate.ok
+        data["certificate"] = {
+            "checks": certificate.checks,
+            "primes": len(certificate.primes),
+            "bits": certificate.bits,
+            "failures": list(certificate.failures),
+            "seconds": certificate.seconds,
+        }
+        status = 0 if certificate.ok else 1
+    data["total_seconds"] = time.perf_counter() - STARTED
+    data["peak_memory_bytes"] = peak_memory_bytes()
+    if arguments.json:
+        output.result(data)
+    else:
+        print_minimisation(data, output)
+    return status
+
+
+def print_minimisation(data: dict[str, Any], output: Output) -> None:
+    """The figures of `minimise` for people."""
+    table = make_table(f"{data['model']}, minimised", {"": "left", " ": "right"})
+    table.show_header = False
+    table.add_row("states", big(data["states"]))
+    if "reachable_states" in data:
+        table.add_row("reachable states", big(data["reachable_states"]))
+    table.add_row("blocks", f"{data['blocks']:,}")
+    table.add_row("rounds", f"{data['rounds']:,}")
+    table.add_row("diagram nodes (peak)", f"{data['nodes']:,} ({data['peak_nodes']:,})")
+    table.add_row("chance of an unseen split", f"below {data['collision_bound']:.1g}")
+    if "certified" in data:
+        certificate = data["certificate"]
+        verdict = "yes" if data["certified"] else "NO"
+        table.add_row(
+            "certified", f"{verdict}: {certificate['checks']:,} checks, {certificate['primes']} primes"
+        )
+    table.add_row("time", seconds(data["seconds"]))
+    table.add_row("kernels loaded or compiled", seconds(data["compile_seconds"]))
+    table.add_row("peak memory", f"{data['peak_memory_bytes'] / 2**20:,.0f} MiB")
+    output.table(table)
+    for failure in data.get("certificate", {}).get("failures", ())[:10]:
+        output.line(f"[red]{escape(failure)}[/]")
+
+
+def plan(arguments: argparse.Namespace, output: Output) -> int:
+    """Plan a hierarchy, print the table, write the plan."""
+    from factored_polca.hierarchy.executable import executable
+    from factored_polca.hierarchy.plan import Options
+    from factored_polca.hierarchy.plan import plan as plan_model
+    from factored_polca.hierarchy.plan_file import save_plan
+    from factored_polca.hierarchy.report import plan_report
+
+    source = load(arguments.model, arguments.set, arguments.tasks)
+    report_warnings(source, output)
+    compile_seconds = compile_kernels(output, solver=True)
+    if source.tasks is None:
+        output.note(f"{source.name} has no tasks: planning one flat task with all actions")
+    memory, deadline = limits(arguments)
+    options = Options(
+        seed=arguments.seed,
+        order=arguments.order,
+        reachable=arguments.reachable,
+        memory_limit=memory,
+        deadline=deadline,
+        flat_block_limit=None if arguments.no_flat else arguments.flat_blocks,
+        solver=arguments.solver,
+    )
+
+    def progress(task: str, stage: str, number: int, blocks: int) -> None:
+        detail = f": round {number}, {blocks:,} blocks" if blocks else ""
+        output.update(f"{task}: {stage}{detail}")
+
+    with output.progress(f"planning {source.name}"):
+        found = plan_model(source.model, source.tasks, options, progress=progress)
+    data = plan_report(found)
+    data |= {
+        "parse_seconds": source.parse_seconds,
+        "compile_seconds": compile_seconds,
+        "total_seconds": time.perf_counter() - STARTED,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    for warning in found.warnings:
+        output.warn(warning)
+    if arguments.output is not None:
+        from factored_polca.cli.output import finite
+
+        save_plan(executable(found, finite(data)), arguments.output)
+    if arguments.json:
+        output.result(data)
+    else:
+        print_plan(data, output)
+        if arguments.output is not None:
+            output.note(
+                f"plan written to {arguments.output}; try: factored-polca simulate {arguments.output}"
+            )
+    return 0
+
+
+def print_plan(data: dict[str, Any], output: Output) -> None:
+    """The figures of `plan` for people."""
+    columns = {
+        "task": "left", "actions": "left", "blocks": "right", "Q-values": "right",
+        "classes": "right", "shared": "right", "value": "right", "time": "right",
+    }  # fmt: skip
+    table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
+    for row in data["tasks"]:
+        names = row["actions"]
+        shown = ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
+        table.add_row(
+            escape(row["name"]), escape(shown), f"{row['blocks']:,}", f"{row['q_values']:,}",
+            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", f"{row['value']:.6g}",
+            seconds(row["seconds"]),
+        )  # fmt: skip
+    table.add_section()
+    total = data["totals"]
+    table.add_row(
+        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", f"{total['q_values']:,}",
+        f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
+    )  # fmt: skip
+    output.table(table)
+    output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
+    if data["flat_value"] is None:
+        output.line(f"flat optimum: {escape(data['flat_note'])}")
+    else:
+        cost = data["flat_value"] - data["value"]
+        said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
+        output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
+    output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def act(arguments: argparse.Namespace, output: Output) -> int:
+    """Say what a plan does in a state."""
+    from factored_polca.control import Controller
+    from factored_polca.hierarchy.plan_file import load_plan
+
+    plan = load_plan(arguments.plan)
+    state = parse_state(arguments.state, plan.model)
+    decision = Controller(plan).poll(state)
+    path = [
+        {
+            "task": poll.task,
+            "block": poll.block,
+            "block_states": poll.block_states,
+            "action": poll.action,
+            "terminal": poll.terminal,
+        }
+        for poll in decision.path
+    ]
+    data = {"action": decision.action, "path": path}
+    if arguments.json:
+        output.result(data)
+        return 0
+    table = make_table(
+        "polled from the top", {"task": "left", "block": "right", "states in it": "right", "answer": "left"}
+    )
+    for poll in decision.path:
+        answer = poll.action or ("the task has ended" if poll.terminal else "no action: a dead end")
+        block = "none" if poll.block is None else f"{poll.block:,}"
+        table.add_row(escape(poll.task), block, big(poll.block_states), escape(answer))
+    output.table(table)
+    output.line(f"action: [bold]{escape(decision.action or 'none')}[/]")
+    return 0
+
+
+def simulate(arguments: argparse.Namespace, output: Output) -> int:
+    """Run a plan on the original model."""
+    from factored_polca.hierarchy.plan_file import load_plan
+    from factored_polca.simulation import simulate as run
+
+    plan = load_plan(arguments.plan)
+    with output.progress(f"simulating {arguments.episodes:,} episodes"):
+        result = run(plan, episodes=arguments.episodes, steps=arguments.steps, seed=arguments.seed)
+    planned = plan.report.get("value")
+    data = {
+        "mean": result.mean,
+        "standard_error": result.standard_error,
+        "episodes": result.episodes,
+        "steps": result.steps,
+        "ended": result.ended,
+        "truncation": result.truncation,
+        "planned_value": planned,
+        "seed": arguments.seed,
+    }
+    if arguments.json:
+        output.result(data)
+        return 0
+    output.line(
+        f"mean return [bold]{result.mean:.6g}[/] ± {result.standard_error:.2g} (standard error, "
+        f"{result.episodes:,} episodes of at most {result.steps:,} steps, {result.ended:,} ended)"
+    )
+    if isinstance(planned, (int, float)):
+        output.line(f"planned value: {planned:.6g}")
+    if result.truncation > max(result.standard_error, 1e-6 * abs(result.mean)):
+        output.line(f"cut off: longer episodes may change the mean by up to {result.truncation:.2g}")
+    return 0

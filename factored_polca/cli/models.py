@@ -1,0 +1,232 @@
+"""The commands about models: domains, new, info, check, convert."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import secrets
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+
+from factored_polca import library
+from factored_polca.cli.output import Output, big, make_table
+from factored_polca.cli.source import UsageError, load
+from factored_polca.models import Model, ModelError, TaskHierarchy, Value
+from factored_polca.models.expressions import references
+
+
+def domains(arguments: argparse.Namespace, output: Output) -> int:
+    """List the shipped domains."""
+    described = [library.describe(name) for name in library.domains()]
+    if arguments.json:
+        rows = [{"name": d.name, "summary": d.summary} for d in described]
+        output.result({"domains": rows})
+        return 0
+    table = make_table("shipped domains", {"name": "left", "what it is": "left", "parameters": "left"})
+    for d in described:
+        parameters = ", ".join(f"{p.name}={show(p.default)}" for p in d.parameters)
+        table.add_row(escape(d.name), escape(d.summary), escape(parameters))
+    output.table(table)
+    output.line(
+        "factored-polca info NAME tells more; factored-polca plan NAME --set size=8 sets a parameter"
+    )
+    return 0
+
+
+def show(value: object) -> str:
+    """A value as it is written."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def new(arguments: argparse.Namespace, output: Output) -> int:
+    """Write a commented template."""
+    from factored_polca.formats import template
+
+    name = arguments.name
+    if not name or not all(c.isalnum() or c in "-_" for c in name):
+        raise UsageError(f"NAME may have letters, digits, - and _, not {name!r}")
+    path = Path(f"{name}.toml")
+    if path.exists():
+        raise ModelError(f"{path} exists already; choose another name or remove it")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        temporary.write_text(template(name), encoding="utf-8")
+        os.link(temporary, path)
+    except FileExistsError:
+        raise ModelError(f"{path} exists already; choose another name or remove it") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+    if arguments.json:
+        output.result({"file": str(path)})
+    else:
+        output.line(f"{escape(str(path))} written; try: factored-polca plan {escape(str(path))}")
+    return 0
+
+
+def info(arguments: argparse.Namespace, output: Output) -> int:
+    """Describe a model or a domain."""
+    source = load(arguments.model, arguments.set)
+    model = source.model
+    is_domain = source.name in library.domains() and not Path(arguments.model).is_file()
+    described = library.describe(source.name) if is_domain else None
+    data = model_data(model, source.tasks)
+    if described is not None:
+        data["documentation"] = described.documentation
+        data["domain_parameters"] = [
+            {"name": p.name, "default": show(p.default), "kind": p.kind, "documentation": p.documentation}
+            for p in described.parameters
+        ]
+    if arguments.json:
+        output.result(data)
+        return 0
+    if described is not None:
+        output.line(escape(described.documentation.strip()))
+        table = make_table(
+            "parameters (--set NAME=VALUE)",
+            {"name": "left", "default": "left", "kind": "left", "meaning": "left"},
+        )
+        for p in described.parameters:
+            table.add_row(escape(p.name), escape(show(p.default)), escape(p.kind), escape(p.documentation))
+        output.table(table)
+    print_model(data, output)
+    return 0
+
+
+def model_data(model: Model, tasks: TaskHierarchy | None) -> dict[str, Any]:
+    """A model's figures as plain data."""
+    actions = [
+        {
+            "name": action.name,
+            "changes": [name for name, _ in action.effects],
+            "parents": sorted({shown_reference(r) for _, e in action.effects for r in references(e)}),
+            "always_applicable": str(action.applicable) == "true",
+        }
+        for action in model.actions
+    ]
+    return {
+        "model": model.name,
+        "description": model.description,
+        "states": model.states,
+        "observability": model.observability,
+        "discount": str(model.discount),
+        "features": [
+            {"name": f.name, "values": list(f.values), "observed": f.observed} for f in model.features
+        ],
+        "observations": [{"name": o.name, "values": list(o.values)} for o in model.observations],
+        "actions": actions,
+        "terminal": shorten(str(model.terminal)),
+        "reward_terms": len(model.rewards) + sum(len(a.rewards) for a in model.actions),
+        "parameters": {name: str(value) for name, value in model.parameters},
+        "tasks": [
+            {
+                "name": t.name,
+                "actions": list(t.actions),
+                "terminal": shorten(str(t.terminal)),
+                "pseudo_reward": t.has_pseudo_reward,
+            }
+            for t in (tasks.tasks if tasks else ())
+        ],
+    }
+
+
+def shown_reference(reference: Any) -> str:
+    """A reference as it is written."""
+    return f"{reference.name}'" if reference.primed else str(reference.name)
+
+
+def shorten(text: str, limit: int = 120) -> str:
+    """The start of a long text."""
+    return text if len(text) <= limit else text[: limit - 4] + " ..."
+
+
+def values_text(values: list[Value]) -> str:
+    """Values on one line."""
+    shown = [show(v) for v in values]
+    return ", ".join(shown if len(shown) <= 10 else [*shown[:6], "...", shown[-1]])
+
+
+def print_model(data: dict[str, Any], output: Output) -> None:
+    """A model's figures for people."""
+    observed = "fully" if data["observability"] == "full" else "partially"
+    output.line(
+        f"[bold]{escape(data['model'])}[/]: {big(data['states'])} states, {len(data['features'])} "
+        f"features, {len(data['actions'])} actions, {observed} observed, discount {data['discount']}"
+    )
+    table = make_table("features", {"name": "left", "values": "left", "changed by": "left"})
+    changed = Counter(name for action in data["actions"] for name in action["changes"])
+    for feature in data["features"][:40]:
+        values = f"{len(feature['values'])}: {values_text(feature['values'])}"
+        table.add_row(escape(feature["name"]), escape(values), f"{changed[feature['name']]} actions")
+    if len(data["features"]) > 40:
+        table.add_row(f"... {len(data['features']) - 40} more", "", "")
+    output.table(table)
+    table = make_table("actions", {"name": "left", "changes": "left", "depends on": "left"})
+    for action in data["actions"][:40]:
+        table.add_row(
+            escape(action["name"]), escape(shorten(", ".join(action["changes"]), 60)),
+            escape(shorten(", ".join(action["parents"]), 60)),
+        )  # fmt: skip
+    if len(data["actions"]) > 40:
+        table.add_row(f"... {len(data['actions']) - 40} more", "", "")
+    output.table(table)
+    if data["tasks"]:
+        table = make_table("tasks", {"name": "left", "actions": "left", "ends where": "left"})
+        for task in data["tasks"][:40]:
+            table.add_row(
+                escape(task["name"]),
+                escape(shorten(", ".join(task["actions"]), 60)),
+                escape(task["terminal"]),
+            )
+        output.table(table)
+    if data["parameters"]:
+        listed = ", ".join(f"{name} = {value}" for name, value in data["parameters"].items())
+        output.line(f"parameters (--set NAME=VALUE): {escape(listed)}")
+
+
+def check(arguments: argparse.Namespace, output: Output) -> int:
+    """Check a model and its tasks completely."""
+    from factored_polca.hierarchy.check import checked
+    from factored_polca.symbolic import compile_model
+
+    source = load(arguments.model, arguments.set)
+    faults = []
+    try:
+        compile_model(source.model)
+    except ModelError as error:
+        faults += error.faults
+    if source.tasks is not None:
+        try:
+            checked(source.model, source.tasks)
+        except ModelError as error:
+            faults += error.faults
+    if arguments.json:
+        rows = [
+            {"message": f.message, "path": list(f.path), "hint": f.hint, "line": f.line, "column": f.column}
+            for f in faults
+        ]
+        output.result({"model": source.model.name, "ok": not faults, "faults": rows})
+    elif not faults:
+        output.line(f"{escape(source.name)}: no fault found ({big(source.model.states)} states)")
+        for warning in source.warnings:
+            output.warn(str(warning))
+    if faults and not arguments.json:
+        raise ModelError(faults)
+    return 2 if faults else 0
+
+
+def convert(arguments: argparse.Namespace, output: Output) -> int:
+    """Read a model and write it in another format."""
+    from factored_polca.formats import write
+
+    source = load(arguments.model, arguments.set)
+    for warning in source.warnings:
+        output.warn(str(warning))
+    write(source.model, arguments.output, source.tasks)
+    if arguments.json:
+        output.result({"file": arguments.output, "states": source.model.states})
+    else:
+        output.note(f"{arguments.output} written")
+    return 0

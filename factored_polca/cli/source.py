@@ -1,0 +1,135 @@
+"""What a command works on: the MODEL argument, parameters, sizes and states given as text."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from factored_polca import library
+from factored_polca.formats import FORMATS, read
+from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, Value
+
+_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+
+
+class UsageError(Exception):
+    """A wrong argument on the command line."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model and its tasks, where they came from, and how long reading took."""
+
+    name: str
+    model: Model
+    tasks: TaskHierarchy | None
+    warnings: tuple[Fault, ...]
+    parse_seconds: float
+
+
+def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> Source:
+    """The model that MODEL names: a file, or else a shipped domain.
+
+    Raises:
+        ModelError: neither, or not a right model.
+    """
+    began = time.perf_counter()
+    parameters = parse_settings(settings)
+    path = Path(text)
+    warnings: tuple[Fault, ...] = ()
+    if path.is_file() or path.suffix.lower() in FORMATS or path.is_dir():
+        document = read(path, parameters)
+        name, model, hierarchy, warnings = path.name, document.model, document.tasks, document.warnings
+    elif text in library.domains():
+        domain = library.load(text, parameters)
+        name, model, hierarchy = text, domain.model, domain.tasks
+    else:
+        domains, extensions = ", ".join(library.domains()), ", ".join(FORMATS)
+        raise ModelError(
+            f"{text}: no such file and no shipped domain; domains are {domains}; files end in {extensions}"
+        )
+    if tasks is not None:
+        hierarchy = read_tasks(tasks, model)
+    return Source(name, model, hierarchy, warnings, time.perf_counter() - began)
+
+
+def read_tasks(text: str, model: Model) -> TaskHierarchy:
+    """The tasks of another file, for `model`.
+
+    Raises:
+        ModelError: the file is not right or holds no tasks.
+    """
+    from factored_polca.formats.native import read_native_tasks
+
+    path = Path(text)
+    try:
+        content = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ModelError(f"{text}: can't be read ({error})") from None
+    try:
+        return read_native_tasks(content, model)
+    except ModelError as error:
+        raise error.in_file(text) from None
+
+
+def parse_settings(settings: Sequence[str]) -> dict[str, str]:
+    """`["size=10"]` as {"size": "10"}.
+
+    Raises:
+        UsageError: without "=".
+    """
+    result: dict[str, str] = {}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        if not equals or not name:
+            raise UsageError(f"--set takes NAME=VALUE, not {setting!r}")
+        result[name.strip()] = value.strip()
+    return result
+
+
+def parse_memory(text: str) -> int:
+    """`2GB`, `500MiB` or a plain number of bytes.
+
+    Raises:
+        UsageError: anything else.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]i?)?b?\s*", text.lower())
+    if match is None or float(match[1]) <= 0 or len(match[1]) > 18:
+        raise UsageError(f"--memory takes a size such as 2GB or 500MiB, not {text!r}")
+    return int(float(match[1]) * _UNITS[match[2] or ""])
+
+
+def parse_state(text: str, model: Model) -> dict[str, Value]:
+    """`x=3,y=on` as {feature: value}.
+
+    Raises:
+        ModelError: an unknown feature or value, or a feature without one.
+    """
+    state: dict[str, Value] = {}
+    for part in text.split(","):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise ModelError(f"--state takes FEATURE=VALUE,..., not {part!r}")
+        try:
+            feature = model.feature(name)
+        except KeyError as error:
+            raise ModelError(str(error.args[0])) from None
+        if name in state:
+            raise ModelError(f"--state gives {name} twice")
+        by_text = value_texts(feature.values)
+        if value not in by_text:
+            listed = ", ".join(list(by_text)[:20])
+            raise ModelError(f"{name} has no value {value!r}; it has {listed}")
+        state[name] = by_text[value]
+    missing = [feature.name for feature in model.features if feature.name not in state]
+    if missing:
+        raise ModelError(f"--state gives no value for {', '.join(missing)}")
+    return state
+
+
+def value_texts(values: Sequence[Value]) -> Mapping[str, Value]:
+    """Values by the text a person writes for them."""
+    return {str(v).lower() if isinstance(v, bool) else str(v): v for v in values}
