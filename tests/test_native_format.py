@@ -569,7 +569,7 @@ FAULTS = [
     (HEAD + "a" + ".a" * 32 + "§" + ".a" * 100_000 + "=1", "deeper than 32 levels", ""),
     (HEAD + "reward = §" + "9" * 5000, "a number of more than 400 digits", ""),
     (HEAD + "reward = §0x" + "F" * 9000, "a number of more than 400 digits", ""),
-    (HEAD + "reward = 'x + §" + "9" * 5000 + "'", "a number of more than 400 digits", ""),
+    (HEAD + "reward = 'x + §" + "9" * 5000 + "'", "a number of more than 4000 digits", ""),
     (HEAD + "reward = §1e400000", "a decimal exponent beyond 400", ""),
     (HEAD + "reward = 'x ** §1e99999999'", "a decimal exponent beyond 400", ""),
     (HEAD + "reward = '§\ud800'", "surrogate", ""),
@@ -727,11 +727,10 @@ def test_a_long_expression_is_broken_into_lines_and_stays_the_same() -> None:
         (simple(rewards="y + 1"), None, "unknown name 'y'"),
         (simple(), TaskHierarchy([Task("T", ["b"])]), "'b' is neither an action nor a task"),
         (simple(description="\ud800"), None, "surrogate"),
-        (simple(rewards=[Constant(Fraction(3**2000))]), None, "digits"),
         (simple(rewards=[Constant(Fraction(2**16000))]), None, "digits"),
         (Model("m", [Feature("x", (10**20, 1))], [Action("a")]), None, "18 digits"),
     ],
-    ids=["unsound", "tasks", "surrogate", "digits", "more digits", "value"],
+    ids=["unsound", "tasks", "surrogate", "digits", "value"],
 )
 def test_what_the_format_cannot_hold_is_refused(
     model: Model, tasks: TaskHierarchy | None, message: str

@@ -332,7 +332,7 @@ GO = "action go x (SAMEx) y (SAMEy) endaction"
         (small(GO + " reward [! (1)]"), "no operator that is read"),
         (small(GO + " reward [/ (1) (0)]"), "division by zero"),
         (small(GO + " reward (x (a ()) (b (1)))"), "a variable, the name of a dd or a number"),
-        (small(GO + " reward " + "9" * 500), "digits"),
+        (small(GO + " reward " + "9" * 5000), "digits"),
         (small(GO + " reward 1e9999"), "exponent"),
         (small("dd m (1) enddd dd m (1) enddd" + GO), "dd 'm' is defined twice"),
         (small("dd m (1 0) enddd" + GO), "2 numbers in dd m"),

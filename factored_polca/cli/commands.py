@@ -8,9 +8,7 @@ import sys
 import time
 from typing import Any
 
-from rich.markup import escape
-
-from factored_polca.cli.output import Output, big, make_table, seconds
+from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, load, parse_memory, parse_state
 
 STARTED = time.perf_counter()
@@ -206,15 +204,13 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
 def print_plan(data: dict[str, Any], output: Output) -> None:
     """The figures of `plan` for people."""
     columns = {
-        "task": "left", "actions": "left", "blocks": "right", "Q-values": "right",
+        "task": "left", "actions": "right", "blocks": "right", "Q-values": "right",
         "classes": "right", "shared": "right", "value": "right", "time": "right",
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
-        names = row["actions"]
-        shown = ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
         table.add_row(
-            escape(row["name"]), escape(shown), f"{row['blocks']:,}", f"{row['q_values']:,}",
+            escape(row["name"]), f"{len(row['actions']):,}", f"{row['blocks']:,}", f"{row['q_values']:,}",
             f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", f"{row['value']:.6g}",
             seconds(row["seconds"]),
         )  # fmt: skip

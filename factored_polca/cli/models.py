@@ -9,12 +9,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
-
 from factored_polca import library
-from factored_polca.cli.output import Output, big, make_table
+from factored_polca.cli.output import Output, big, escape, make_table
 from factored_polca.cli.source import UsageError, load
-from factored_polca.models import Model, ModelError, TaskHierarchy, Value
+from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, Value
 from factored_polca.models.expressions import references
 
 
@@ -192,7 +190,7 @@ def check(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.symbolic import compile_model
 
     source = load(arguments.model, arguments.set)
-    faults = []
+    faults: list[Fault] = []
     try:
         compile_model(source.model)
     except ModelError as error:

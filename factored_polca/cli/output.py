@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
@@ -20,8 +21,7 @@ class Output:
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self.as_json, self.quiet = as_json, quiet
-        self.out = Console(highlight=False, soft_wrap=False)
-        self.err = Console(stderr=True, highlight=False)
+        self.out, self.err = console(sys.stdout), console(sys.stderr)
         self._status: Status | None = None
 
     def note(self, text: str) -> None:
@@ -58,9 +58,10 @@ class Output:
             self._status.update(escape(text))
 
     def result(self, data: Mapping[str, Any]) -> None:
-        """Print the one JSON object."""
-        json.dump(finite(data), sys.stdout, allow_nan=False)
-        sys.stdout.write("\n")
+        """Print the one JSON object; its integers are exact, however long."""
+        with any_integer():
+            text = json.dumps(finite(data), allow_nan=False)
+        sys.stdout.write(text + "\n")
 
     def table(self, table: Table) -> None:
         """Print a table on stdout."""
@@ -69,6 +70,32 @@ class Output:
     def line(self, text: str = "") -> None:
         """Print a line on stdout; `text` may hold markup."""
         self.out.print(text, soft_wrap=True)
+
+
+def console(file: IO[str]) -> Console:
+    """A console on `file` that shows text as it is, but for the markup that we write ourselves."""
+    piped = not file.isatty() and "COLUMNS" not in os.environ
+    return Console(file=file, highlight=False, emoji=False, width=PIPE_WIDTH if piped else None)
+
+
+def escape(text: str) -> str:
+    """`text` as it is to be seen: brackets are no markup, control characters are shown as escapes.
+
+    Names in model files are other people's; they must not move the cursor or change the colours.
+    """
+    shown = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    return markup.escape(shown)
+
+
+@contextmanager
+def any_integer() -> Iterator[None]:
+    """Lift Python's limit on the digits of an integer that is turned into text."""
+    limit = sys.get_int_max_str_digits()
+    sys.set_int_max_str_digits(0)
+    try:
+        yield
+    finally:
+        sys.set_int_max_str_digits(limit)
 
 
 def finite(value: Any) -> Any:
@@ -84,10 +111,11 @@ def finite(value: Any) -> Any:
 
 def big(number: int) -> str:
     """A whole number with separators, or its size where it is very long."""
-    text = f"{number:,}"
-    return (
-        text if len(text) <= 27 else f"{number:.4e}" if number < 10**300 else f"10^{len(str(number)) - 1}"
-    )
+    if number < 10**20:
+        return f"{number:,}"
+    if number < 10**300:
+        return f"{number:.4e}"
+    return f"10^{math.log10(number):.1f}"
 
 
 def seconds(value: float) -> str:
@@ -96,10 +124,19 @@ def seconds(value: float) -> str:
 
 
 def make_table(title: str, columns: Mapping[str, str]) -> Table:
-    """An empty table; `columns` maps headings to "left" or "right"."""
-    table = Table(title=escape(title), title_justify="left", title_style="bold", header_style="bold")
+    """An empty table; `columns` maps headings to "left" or "right".
+
+    Only columns on the left give way where the terminal is narrow.
+    """
+    table = Table(
+        title=escape(title), title_justify="left", title_style="bold", header_style="bold",
+        box=box.SIMPLE_HEAD, pad_edge=False,
+    )  # fmt: skip
     for heading, side in columns.items():
-        right = side == "right"
-        one_line = right or heading in ("task", "actions")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=one_line)
+        table.add_column(
+            heading,
+            justify="right" if side == "right" else "left",
+            no_wrap=side == "right",
+            overflow="fold",
+        )
     return table

@@ -47,8 +47,8 @@ because there every key is a feature.  Every key is known or an error.
 """
 
 from factored_polca.formats.document import Document
-from factored_polca.formats.native_reader import read_native
+from factored_polca.formats.native_reader import read_native, read_native_tasks
 from factored_polca.formats.native_template import template
 from factored_polca.formats.native_writer import write_native
 
-__all__ = ["Document", "read_native", "template", "write_native"]
+__all__ = ["Document", "read_native", "read_native_tasks", "template", "write_native"]

@@ -68,6 +68,26 @@ def read_native(text: str, overrides: Mapping[str, str] | None = None, *, name: 
     return Document(document.model, document.tasks, warnings)
 
 
+def read_native_tasks(text: str, model: Model) -> TaskHierarchy:
+    """The tasks that `text` describes, for another file's or a domain's model; other tables are skipped.
+
+    Raises:
+        ModelError: no tasks, or faults, each with line and column.
+    """
+    text = text.removeprefix("\ufeff").replace("\r\n", "\n")
+    reader = _Reader(load(text))
+    reader.scope = model.scope()
+    table = reader.section("tasks", MAXIMUM_TASKS)
+    if not table:
+        reader.fault("there are no tasks", ("tasks",), "add a table such as [tasks.Root]")
+    tasks = TaskHierarchy(reader.task(key, value) for key, value in table.items())
+    if table:
+        reader.checked(check_tasks(model, tasks))
+    if reader.found:
+        raise reader.located(text, reader.found)
+    return tasks
+
+
 @dataclass(frozen=True, slots=True)
 class _Found:
     """A fault and where to look for its place: `value` is the text that its line and column are in."""

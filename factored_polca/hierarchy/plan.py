@@ -23,7 +23,7 @@ from factored_polca.diagrams import INDEX, Diagram, relabel
 from factored_polca.hierarchy.check import checked, planning_order
 from factored_polca.hierarchy.counts import QValueCounts, count_q_values
 from factored_polca.hierarchy.solved import SolvedTask
-from factored_polca.hierarchy.subtask import subtask_process
+from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.models import (
     Fault,
@@ -225,6 +225,7 @@ class _Planner:
         method = solver_of(task, self.options)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.reduce(task.name, process, self.options.block_limit)
+        refuse_without_purpose(task, reduction.quotient.mdp)
         solution = self.optimise(task.name, reduction, method)
         counts = count_q_values(process, reduction.partition, self.options.seed)
         policy = reduction.lift_policy(solution.policy)

@@ -12,15 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from factored_polca.diagrams import Diagram, Field, leaves, pairs
-from factored_polca.diagrams.operations import leaf_payloads
+import numpy as np
+
+from factored_polca.diagrams import Diagram
+from factored_polca.explicit.arrays import ArrayMDP
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.minimisation import Choice, DecisionProcess
-from factored_polca.minimisation.criterion import ProcessView, policy_primitives
+from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.models import Fault, Model, ModelError, Task
 from factored_polca.models.expressions import ZERO, Expression
 from factored_polca.symbolic import (
-    NumericView,
     SymbolicModel,
     Term,
     compile_condition,
@@ -34,8 +35,7 @@ def subtask_process(
     """The decision process of `task`, given its children solved.
 
     Raises:
-        ModelError: a condition or reward that is undefined somewhere, or a reward that leaves the
-            task nothing to optimise.
+        ModelError: a condition or reward that is undefined somewhere.
     """
     manager = symbolic.manager
     path = ("tasks", task.name)
@@ -56,9 +56,7 @@ def subtask_process(
             choices.append(Choice(name, app, below, child.policy))
     primitives = sorted({p for choice in choices for p in choice.primitives})
     rewards = {p: local_reward(symbolic, task, p, live) for p in primitives}
-    process = DecisionProcess(symbolic, tuple(choices), terminal, rewards, reachable)
-    refuse_without_purpose(task, process)
-    return process
+    return DecisionProcess(symbolic, tuple(choices), terminal, rewards, reachable)
 
 
 def local_expressions(model: Model, task: Task, action: int) -> list[tuple[Expression, tuple[str, ...]]]:
@@ -86,48 +84,30 @@ def local_reward(symbolic: SymbolicModel, task: Task, action: int, where: Diagra
     return (*outer, *own) if task.adds_reward else own
 
 
-def constant_reward(process: DecisionProcess) -> bool | None:
-    """Whether all applicable pairs (state, choice) have one reward: None no, else whether it is not 0.
-
-    Rewards are compared modulo 2^61 - 1, so a constant may be seen where rewards differ by a multiple
-    of it; no model that a person writes has such rewards.
-    """
-    field = Field()
-    view = ProcessView(process, NumericView(process.symbolic, field))
-    values: set[int] = set()
-    for choice in process.choices:
-        reward, app = view.reward(choice), view.app(choice)
-        if app == process.symbolic.manager.constant(0):
-            continue
-        _, first, second = pairs(app, reward)
-        where = leaf_payloads(app.manager, first) == 1
-        values |= {int(p) for p in leaf_payloads(app.manager, second[where])}
-        if len(values) > 1:
-            return None
-    return values != {0} if values else None
-
-
-def refuse_without_purpose(task: Task, process: DecisionProcess) -> None:
+def refuse_without_purpose(task: Task, mdp: ArrayMDP) -> None:
     """Refuse a task whose local reward gives it nothing to optimise (DESIGN 5; the paper's 4.1).
 
+    `mdp` is the task's quotient.
+
     Raises:
-        ModelError: the local reward is one constant over all applicable pairs, and it is 0 or no
-            state is terminal.
+        ModelError: the local reward is one constant over all applicable pairs at non-terminal states,
+            and it is 0 or no terminal state can be reached.
     """
-    found = constant_reward(process)
-    if found is None:
+    rewards = np.unique(mdp.rewards[mdp.applicable])
+    if len(rewards) != 1:
         return
-    has_end = 1 in leaves(process.terminal)
-    if not found or not has_end:
-        what = "one constant" if found else "0"
-        end = "" if has_end else " and the task never ends"
-        raise ModelError(
-            [
-                Fault(
-                    f"task {task.name!r} has nothing to optimise: its reward is {what} for every action "
-                    f"in every state{end}",
-                    ("tasks", task.name, "pseudo_reward"),
-                    'give it a pseudo_reward, for example "-1" a step until its terminal condition holds',
-                )
-            ]
-        )
+    ends = any((matrix @ mdp.terminal.astype(float)).any() for matrix in mdp.transitions)
+    if rewards[0] != 0 and ends:
+        return
+    what = "0" if rewards[0] == 0 else "one constant"
+    end = "" if ends else " and the task can never end"
+    raise ModelError(
+        [
+            Fault(
+                f"task {task.name!r} has nothing to optimise: its reward is {what} for every action in "
+                f"every state{end}",
+                ("tasks", task.name, "pseudo_reward"),
+                'give it a pseudo_reward, for example "-1" a step until its terminal condition holds',
+            )
+        ]
+    )

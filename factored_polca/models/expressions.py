@@ -31,8 +31,8 @@ Value = Union[bool, int, str]
 Scalar = Union[Fraction, bool, str]
 """A value of an expression: integers are rationals here."""
 
-MAXIMUM_BITS: Final = 20_000
-"""Largest numerator or denominator, in bits, that arithmetic on constants may produce."""
+MAXIMUM_BITS: Final = 13_000
+"""Largest numerator or denominator, in bits: fewer than the 4300 digits that Python prints."""
 
 MAXIMUM_EXPONENT: Final = 1_000
 """Largest absolute value of an exponent."""

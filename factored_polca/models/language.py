@@ -31,6 +31,7 @@ from typing import Final
 from factored_polca.models.errors import Fault, ModelError
 from factored_polca.models.expressions import (
     FALSE,
+    MAXIMUM_BITS,
     ONE,
     OPERATORS,
     TRUE,
@@ -53,9 +54,9 @@ from factored_polca.models.expressions import (
 
 MAXIMUM_LENGTH: Final = 1_000_000
 """Characters in one expression."""
-MAXIMUM_DEPTH: Final = 150
+MAXIMUM_DEPTH: Final = 80
 """Levels of nesting."""
-MAXIMUM_DIGITS: Final = 400
+MAXIMUM_DIGITS: Final = 4_000
 """Digits in one number."""
 MAXIMUM_DECIMAL_EXPONENT: Final = 400
 
@@ -111,7 +112,10 @@ def number(text: str) -> Fraction:
         raise ValueError(f"a number of more than {MAXIMUM_DIGITS} digits")
     if exponent and (len(exponent) > 6 or abs(int(exponent)) > MAXIMUM_DECIMAL_EXPONENT):
         raise ValueError(f"a decimal exponent beyond {MAXIMUM_DECIMAL_EXPONENT}")
-    return Fraction(text)
+    value = Fraction(text)
+    if max(value.numerator.bit_length(), value.denominator.bit_length()) > MAXIMUM_BITS:
+        raise ValueError(f"a number of more than {MAXIMUM_BITS} bits")
+    return value
 
 
 class _Parser:
@@ -235,21 +239,25 @@ class _Parser:
         return operation("not", test) if negated else test
 
     def sum(self) -> Expression:
-        result = self.term()
+        parts = [self.term()]
         while self.token.kind == "symbol" and self.token.text in _SUMS:
             minus = self.token.text == "-"
             self.position += 1
             right = self.term()
-            result = operation("add", result, operation("negate", right) if minus else right)
-        return result
+            parts.append(operation("negate", right) if minus else right)
+        return operation("add", *parts) if len(parts) > 1 else parts[0]
 
     def term(self) -> Expression:
-        result = self.factor()
+        run = [self.factor()]
         while self.token.kind == "symbol" and self.token.text in _TERMS:
             name = _TERMS[self.token.text]
             self.position += 1
-            result = operation(name, result, self.factor())
-        return result
+            if name == "multiply":
+                run.append(self.factor())
+                continue
+            left = operation("multiply", *run) if len(run) > 1 else run[0]
+            run = [operation(name, left, self.factor())]
+        return operation("multiply", *run) if len(run) > 1 else run[0]
 
     def factor(self) -> Expression:
         if self.accept("-"):
@@ -392,8 +400,8 @@ def parse(text: str, scope: Scope | None = None) -> Expression:
     """
     parser = _Parser(text, scope)
     result = parser.whole()
-    if depth(result) > 2 * MAXIMUM_DEPTH:
-        raise parser.error(f"an expression nested deeper than {2 * MAXIMUM_DEPTH} levels", 0)
+    if depth(result) > 3 * MAXIMUM_DEPTH:
+        raise parser.error(f"an expression nested deeper than {3 * MAXIMUM_DEPTH} levels", 0)
     return result
 
 

@@ -18,6 +18,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from typing import Any, Literal
 
 from factored_polca.models.expressions import (
@@ -202,6 +203,10 @@ class Model:
 
     def scope(self) -> Scope:
         """The names that expressions of this model may use."""
+        return self._scope
+
+    @cached_property
+    def _scope(self) -> Scope:
         names = [value for f in self.features for value in f.values if isinstance(value, str)]
         names += [value for o in self.observations for value in o.values if isinstance(value, str)]
         return Scope(
