@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import networkx as nx
+import numpy as np
 
+from factored_polca.minimisation import flat_process, reduce
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, check_tasks, resolve_tasks
 from factored_polca.models.tasks import Task
+from factored_polca.solvers import solve_mdp
+from factored_polca.symbolic import SymbolicModel
 
 
 def task_graph(hierarchy: TaskHierarchy) -> nx.DiGraph:
@@ -45,3 +49,36 @@ def checked(model: Model, hierarchy: TaskHierarchy) -> TaskHierarchy:
     if faults:
         raise ModelError(faults)
     return resolved
+
+
+def check_undiscounted(symbolic: SymbolicModel, *, block_limit: int = 100_000) -> list[Fault]:
+    """Faults of a model with discount 1: an infinite value, or a start without a proper policy.
+
+    It takes the quotient of the model to see: end components with rewards, and states from which no
+    policy is sure to end.
+
+    Raises:
+        LimitReached: more than `block_limit` blocks.
+    """
+    if symbolic.model.discount != 1 or symbolic.model.horizon is not None:
+        return []
+    reduction = reduce(flat_process(symbolic), block_limit=block_limit)
+    partition = reduction.partition
+
+    def describe(block: int) -> str:
+        return symbolic.state_text(partition.representatives[block].tolist())
+
+    try:
+        solution = solve_mdp(reduction.quotient.mdp, describe=describe)
+    except ModelError as error:
+        return list(error.faults)
+    lost = np.flatnonzero((reduction.project_initial() > 0) & solution.dead_ends)
+    if not len(lost):
+        return []
+    return [
+        Fault(
+            f"with discount 1 no policy is sure to end from a start state like {describe(int(lost[0]))}",
+            ("discount",),
+            "give a discount below 1, or make the end reachable",
+        )
+    ]

@@ -75,14 +75,21 @@ def feature_states(partition: Partition) -> npt.NDArray[np.int32]:
 def exact_rewards(
     process: DecisionProcess, primitive: int, states: npt.NDArray[np.int32]
 ) -> list[Fraction]:
-    """The reward of a primitive at states [state, feature], as exact sums of its terms."""
+    """The reward of a primitive at states [state, feature], as exact sums of its terms.
+
+    States on which all terms agree share one sum, so few sums are formed where few rewards differ.
+    """
     columns = process.symbolic.columns()
-    totals = [Fraction(0)] * len(states)
-    for term in process.rewards[primitive]:
-        leaf = evaluate_states(term.diagram, states, columns)
-        for i, number in enumerate(leaf.tolist()):
-            totals[i] += term.values[number]
-    return totals
+    terms = process.rewards[primitive]
+    if not terms:
+        return [Fraction(0)] * len(states)
+    entries = np.stack([evaluate_states(term.diagram, states, columns) for term in terms], axis=1)
+    distinct, place = np.unique(entries.astype(np.int64), axis=0, return_inverse=True)
+    sums = [
+        sum((term.values[number] for term, number in zip(terms, row, strict=True)), Fraction(0))
+        for row in distinct.tolist()
+    ]
+    return [sums[index] for index in place.reshape(-1).tolist()]
 
 
 def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:

@@ -55,6 +55,8 @@ def maximal_end_components(pairs: Pairs, usable: BoolArray) -> Components:
     without a pair; until nothing is dropped.
     """
     inside = usable & (np.diff(pairs.row) > 0)
+    if not np.any(inside):
+        return Components(np.full(pairs.nodes, -1, dtype=np.int64), inside, 0)
     while True:
         label = strong_components(pairs, inside)
         own = np.repeat(label[pairs.owner], np.diff(pairs.row))
@@ -114,6 +116,8 @@ def refuse_unbounded(pairs: Pairs, describe: Describe | None) -> None:
     Raises:
         ModelError: a component has a mean reward that is positive, or 0 with rewards that are not.
     """
+    if not np.any(pairs.reward > 0):
+        return
     components = maximal_end_components(pairs, pairs.action != STAY)
     faults = list(_component_faults(pairs, components, describe))
     if faults:

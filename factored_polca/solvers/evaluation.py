@@ -19,7 +19,7 @@ from factored_polca.solvers.graph import distance_order
 from factored_polca.solvers.pairs import Pairs
 from factored_polca.solvers.sweeps import backup, initial_choice
 
-FACTORISATION_LIMIT = 3000
+FACTORISATION_LIMIT = 1500
 """Nodes up to which sparse LU is the first choice: beyond, fill-in can take it all."""
 
 EVALUATIONS = 100
@@ -118,16 +118,16 @@ def expected_steps(pairs: Pairs, policy: IntArray, stop: StopRule) -> FloatArray
     Raises:
         TimeIsUp: the deadline has passed.
     """
-    ones = np.ones(pairs.count)
     if len(pairs.free) <= FACTORISATION_LIMIT:
-        return evaluate_by_factorisation(pairs, policy, ones)
-    w, choice = np.zeros(pairs.nodes), policy.copy()
+        return evaluate_by_factorisation(pairs, policy, np.ones(pairs.count))
+    own = pairs.select(policy[pairs.free])
+    ones, w, choice = np.ones(own.count), np.zeros(pairs.nodes), initial_choice(own)
     for k in range(PASSES):
         stop.poll()
-        _, growth = backup(pairs, w, w, choice, policy=policy, reward=ones, backward=k % 2 == 0)
+        _, growth = backup(own, w, w, choice, reward=ones, backward=k % 2 == 0)
         if growth <= 0.25:
             out = np.zeros(pairs.nodes)
-            _, growth = backup(pairs, w, out, choice, policy=policy, reward=ones)
+            _, growth = backup(own, w, out, choice, reward=ones)
             if growth <= 0.5:
                 return w
             w = out

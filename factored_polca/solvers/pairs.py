@@ -69,9 +69,8 @@ class Pairs:
     @cached_property
     def predecessors(self) -> tuple[IntArray, IntArray]:
         """(start, pair): `pair[start[i]:start[i+1]]` are the pairs with i among their successors."""
-        order = np.argsort(self.successor, kind="stable")
-        counts = np.bincount(self.successor, minlength=self.nodes)
-        return running_total(counts), self.pair_of_entry[order]
+        columns = self.matrix.tocsc()
+        return columns.indptr.astype(np.int64), columns.indices.astype(np.int64)
 
     def q_values(self, values: FloatArray) -> FloatArray:
         """Q of every pair, one step ahead of `values` [node]."""
@@ -82,21 +81,27 @@ class Pairs:
         hits = self.pair_of_entry[nodes[self.successor]]
         return np.bincount(hits, minlength=self.count) > 0
 
-    def keep(self, mask: BoolArray) -> Pairs:
-        """The same nodes with only the pairs in `mask`."""
-        length = np.diff(self.row)
-        entries = np.repeat(mask, length)
+    def select(self, chosen: IntArray) -> Pairs:
+        """The same nodes with only the pairs `chosen`, given in ascending order."""
+        length = (self.row[1:] - self.row[:-1])[chosen]
+        row = running_total(length)
+        entries = np.repeat(self.row[chosen] - row[:-1], length) + np.arange(row[-1])
+        owner = self.owner[chosen]
         return Pairs(
-            start=running_total(np.bincount(self.owner[mask], minlength=self.nodes)),
-            owner=self.owner[mask],
-            state=self.state[mask],
-            action=self.action[mask],
-            reward=self.reward[mask],
-            row=running_total(length[mask]),
+            start=running_total(np.bincount(owner, minlength=self.nodes)),
+            owner=owner,
+            state=self.state[chosen],
+            action=self.action[chosen],
+            reward=self.reward[chosen],
+            row=row,
             successor=self.successor[entries],
             probability=self.probability[entries],
             discount=self.discount,
         )
+
+    def keep(self, mask: BoolArray) -> Pairs:
+        """The same nodes with only the pairs in `mask`."""
+        return self.select(np.flatnonzero(mask))
 
 
 def running_total(counts: IntArray) -> IntArray:

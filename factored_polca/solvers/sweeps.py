@@ -1,9 +1,8 @@
 """The compiled Bellman backup that every iterative solver here calls.
 
-One kernel serves four purposes: Jacobi (`out` is another array than `values`) or Gauss-Seidel (the
-same array), over all pairs (`first`, `last` = the pairs of each node) or over those of one policy
-(`first` = the chosen pair, `last` = `first` + 1).  Each call is one pass, so that Python sees
-Ctrl-C and deadlines between passes.
+One kernel serves as Jacobi pass (`out` is another array than `values`) and as Gauss-Seidel pass (the
+same array), over all pairs or over those of one policy (`Pairs.select`).  Each call is one pass, so
+that Python sees Ctrl-C and deadlines between passes.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ def _backup(
     values: Any,
     out: Any,
     choice: Any,
-    first: Any,
-    last: Any,
+    start: Any,
     row: Any,
     successor: Any,
     probability: Any,
@@ -35,11 +33,11 @@ def _backup(
     smallest, largest = np.inf, -np.inf
     for k in range(nodes):
         i = nodes - 1 - k if backward else k
-        if first[i] == last[i]:
+        if start[i] == start[i + 1]:
             out[i] = values[i]
             continue
-        best, pick = -np.inf, first[i]
-        for p in range(first[i], last[i]):
+        best, pick = -np.inf, start[i]
+        for p in range(start[i], start[i + 1]):
             expected = 0.0
             for j in range(row[p], row[p + 1]):
                 expected += probability[j] * values[successor[j]]
@@ -62,25 +60,19 @@ def backup(
     out: FloatArray,
     choice: IntArray,
     *,
-    policy: IntArray | None = None,
     reward: FloatArray | None = None,
     backward: bool = False,
 ) -> tuple[float, float]:
     """One pass from `values` to `out` [node] (may be the same array); writes the best pair of each.
 
-    `policy` [node] restricts each node to one pair, `reward` [p] replaces the rewards (minus infinity
-    excludes a pair).  Returns the least and the largest change; (inf, -inf) if no node has a pair.
+    `reward` [p] replaces the rewards (minus infinity excludes a pair).  Returns the least and the
+    largest change; (inf, -inf) if no node has a pair.
     """
-    if policy is None:
-        first, last = pairs.start[:-1], pairs.start[1:]
-    else:
-        first, last = policy, policy + (pairs.start[1:] > pairs.start[:-1])
     smallest, largest = _compiled_backup(
         values,
         out,
         choice,
-        first,
-        last,
+        pairs.start,
         pairs.row,
         pairs.successor,
         pairs.probability,

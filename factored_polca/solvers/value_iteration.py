@@ -7,9 +7,9 @@ cheaper as there are actions.
 
 Discount < 1: every backup gives bounds (`bounds.discounted_interval`); they are intersected with
 those before, so they only tighten.  While it pays, V is moved to the middle of the new bounds
-(Porteus 1975): this removes the slowest error, a constant.  It is given up for good the first time
-that the bounds of one iteration are not tighter than those before; plain iteration contracts by the
-discount.
+(Porteus 1975): this removes the slowest error, a constant.  A move is made only when the bounds are
+at most `SHIFT_PROGRESS` times as wide as at the last move: so either there are infinitely many moves
+and the width goes to 0, or finitely many and plain iteration contracts by the discount.
 
 Discount 1: both start from below, at a multiple of the expected steps of a proper policy that
 satisfies L <= T L.  Then the iterates rise to V*, and the greedy policies are proper.  (From above, a
@@ -40,6 +40,7 @@ from factored_polca.solvers.result import Status
 from factored_polca.solvers.sweeps import backup, initial_choice
 
 POLICY_PASSES = 10
+SHIFT_PROGRESS = 0.9
 PATIENCE = 20
 """Backups at the level of rounding errors, none of which tightened the bounds, before giving up."""
 
@@ -108,8 +109,7 @@ class _State:
         self.interval = prior_interval(pairs)
         self.iterations = 0
         self.status: Status | None = None
-        self.shifting = True
-        self.latest_gap = np.inf
+        self.shifted_gap = np.inf
         self.idle = 0
         self.weights: FloatArray | None = None
         self.attempt_below = np.inf
@@ -165,12 +165,10 @@ class _State:
         if low > high:  # no free node
             return 0.0
         new = discounted_interval(self.rounding, self.out, low, high, error)
-        gap = new.gap
         self.interval = self.interval.tightened(new)
-        self.shifting = self.shifting and gap < self.latest_gap
-        self.latest_gap = gap
-        if not self.shifting:
+        if new.gap > SHIFT_PROGRESS * self.shifted_gap:
             return 0.0
+        self.shifted_gap = new.gap
         first = self.pairs.free[0]
         return float(0.5 * (new.lower[first] + new.upper[first]) - self.out[first])
 
@@ -194,7 +192,8 @@ class _State:
         if self.policy_passes == 0:
             backup(self.pairs, self.values, self.values, self.choice, backward=self.iterations % 2 == 0)
             return
-        policy = self.choice.copy()
+        policy = self.pairs.select(self.choice[self.pairs.free])
+        ignored = initial_choice(policy)
         for k in range(self.policy_passes):
             self.stop.poll()
-            backup(self.pairs, self.values, self.values, self.choice, policy=policy, backward=k % 2 == 0)
+            backup(policy, self.values, self.values, ignored, backward=k % 2 == 0)
