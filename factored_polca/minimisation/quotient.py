@@ -72,24 +72,32 @@ def feature_states(partition: Partition) -> npt.NDArray[np.int32]:
     return np.ascontiguousarray(partition.representatives[:, partition.symbolic.now_levels])
 
 
-def exact_rewards(
+def distinct_rewards(
     process: DecisionProcess, primitive: int, states: npt.NDArray[np.int32]
-) -> list[Fraction]:
-    """The reward of a primitive at states [state, feature], as exact sums of its terms.
+) -> tuple[list[Fraction], npt.NDArray[np.int64]]:
+    """The reward of a primitive at states [state, feature]: the exact sums that occur, and which is where.
 
-    States on which all terms agree share one sum, so few sums are formed where few rewards differ.
+    States on which all terms agree share one sum.
     """
     columns = process.symbolic.columns()
     terms = process.rewards[primitive]
     if not terms:
-        return [Fraction(0)] * len(states)
+        return [Fraction(0)], np.zeros(len(states), dtype=np.int64)
     entries = np.stack([evaluate_states(term.diagram, states, columns) for term in terms], axis=1)
     distinct, place = np.unique(entries.astype(np.int64), axis=0, return_inverse=True)
     sums = [
         sum((term.values[number] for term, number in zip(terms, row, strict=True)), Fraction(0))
         for row in distinct.tolist()
     ]
-    return [sums[index] for index in place.reshape(-1).tolist()]
+    return sums, place.reshape(-1).astype(np.int64)
+
+
+def exact_rewards(
+    process: DecisionProcess, primitive: int, states: npt.NDArray[np.int32]
+) -> list[Fraction]:
+    """The exact reward of a primitive at each of several states [state, feature]."""
+    sums, place = distinct_rewards(process, primitive, states)
+    return [sums[index] for index in place.tolist()]
 
 
 def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
@@ -111,8 +119,8 @@ def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
         plans[p] = (make_plan(symbolic, partition.diagram, rows), row_table(symbolic, rows))
         matrix = push_states(partition, rows, *plans[p], states[chosen_blocks])
         matrices[p] = (chosen_blocks, matrix)
-        exact = exact_rewards(process, p, states[chosen_blocks])
-        gains = np.array([float(value) for value in exact])
+        sums, place = distinct_rewards(process, p, states[chosen_blocks])
+        gains = np.array([float(value) for value in sums])[place]
         for c in range(len(process.choices)):
             mine = primitive[c, chosen_blocks] == p
             rewards[c, chosen_blocks[mine]] = gains[mine]
@@ -174,16 +182,20 @@ def _choice_matrix(
     for p, (chosen_blocks, matrix) in matrices.items():
         mine = np.flatnonzero(primitive[chosen_blocks] == p)
         if len(mine):
-            pieces.append(matrix[mine][:, :blocks])
+            rows = matrix if len(mine) == len(chosen_blocks) else matrix[mine]
+            pieces.append(rows if rows.shape[1] == blocks else rows[:, :blocks])
             targets.append(chosen_blocks[mine])
     if not pieces:
         return sparse.csr_array((blocks, blocks))
-    stacked = sparse.vstack(pieces, format="csr")
     order = np.concatenate(targets)
     place = np.full(blocks, -1, dtype=np.int64)
     place[order] = np.arange(len(order))
-    lengths = np.where(place >= 0, np.diff(stacked.indptr)[place], 0)
-    selected = stacked[place[place >= 0]]
+    if len(pieces) == 1:
+        selected, found = pieces[0], np.diff(pieces[0].indptr)
+    else:
+        stacked = sparse.vstack(pieces, format="csr")
+        selected, found = stacked[place[place >= 0]], np.diff(stacked.indptr)
+    lengths = np.where(place >= 0, found[place], 0)
     pointers = np.concatenate([[0], np.cumsum(lengths)])
     return sparse.csr_array((selected.data, selected.indices, pointers), shape=(blocks, blocks))
 
