@@ -1,0 +1,111 @@
+"""Plan factored Markov decision processes with task hierarchies, by exact symbolic abstraction.
+
+This package offers the names below without loading anything until one of them is used (PEP 562), so
+that `import factored_polca` takes milliseconds.  Each name lives in the layer that `_HOME` says; the
+layers and the directions in which they import one another are drawn in README.md.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from factored_polca.control import Controller, Decision, Poll
+    from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit
+    from factored_polca.formats import Document, read, write
+    from factored_polca.hierarchy import HierarchicalPlan, Options, SolvedTask, plan
+    from factored_polca.hierarchy.executable import ExecutablePlan, executable
+    from factored_polca.hierarchy.plan_file import load_plan, save_plan
+    from factored_polca.hierarchy.report import plan_report
+    from factored_polca.library import domains
+    from factored_polca.library import load as load_domain
+    from factored_polca.minimisation import (
+        Certificate,
+        Minimisation,
+        Partition,
+        Reduction,
+        certify,
+        flat_process,
+        minimise,
+        reduce,
+    )
+    from factored_polca.models import (
+        Action,
+        Fault,
+        Feature,
+        InitialBelief,
+        LimitReached,
+        Model,
+        ModelError,
+        Observation,
+        Task,
+        TaskHierarchy,
+        boolean,
+        check,
+        check_tasks,
+        conditional,
+        lottery,
+        uniform,
+    )
+    from factored_polca.simulation import Simulation, simulate
+    from factored_polca.solvers import MDPSolution, solve_mdp
+    from factored_polca.symbolic import SymbolicModel, compile_model, reachable_states
+
+__version__ = "0.1.0"
+
+_HOME: Final = {
+    "control": ("Controller", "Decision", "Poll"),
+    "diagrams": ("Aborted", "Diagram", "Manager", "MemoryLimit"),
+    "formats": ("Document", "read", "write"),
+    "hierarchy": ("HierarchicalPlan", "Options", "SolvedTask", "plan"),
+    "hierarchy.executable": ("ExecutablePlan", "executable"),
+    "hierarchy.plan_file": ("load_plan", "save_plan"),
+    "hierarchy.report": ("plan_report",),
+    "library": ("domains", "load_domain"),
+    "minimisation": (
+        "Certificate", "Minimisation", "Partition", "Reduction", "certify", "flat_process", "minimise",
+        "reduce",
+    ),
+    "models": (
+        "Action", "Fault", "Feature", "InitialBelief", "LimitReached", "Model", "ModelError", "Observation",
+        "Task", "TaskHierarchy", "boolean", "check", "check_tasks", "conditional", "lottery", "uniform",
+    ),
+    "simulation": ("Simulation", "simulate"),
+    "solvers": ("MDPSolution", "solve_mdp"),
+    "symbolic": ("SymbolicModel", "compile_model", "reachable_states"),
+}  # fmt: skip
+"""Module -> the public names it holds."""
+
+_OWN_NAME: Final = {"load_domain": "load"}
+"""Names that are called otherwise where they live."""
+
+_MODULE: Final = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "Aborted", "Action", "Certificate", "Controller", "Decision", "Diagram", "Document", "ExecutablePlan",
+    "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached", "MDPSolution", "Manager",
+    "MemoryLimit", "Minimisation", "Model", "ModelError", "Observation", "Options", "Partition", "Poll",
+    "Reduction", "Simulation", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "__version__",
+    "boolean", "certify", "check", "check_tasks", "compile_model", "conditional", "domains", "executable",
+    "flat_process", "load_domain", "load_plan", "lottery", "minimise", "plan", "plan_report",
+    "reachable_states", "read", "reduce", "save_plan", "simulate", "solve_mdp", "uniform", "write",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name on first use.
+
+    Raises:
+        AttributeError: no public name.
+    """
+    if name not in _MODULE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f"{__name__}.{_MODULE[name]}")
+    value = getattr(module, _OWN_NAME.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; answer the exit status (0 done, 2 wrong use or model, 3 a limit, 130 Ctrl-C)."""
-    from factored_polca.cli.main import run
+    try:
+        from factored_polca.cli.main import run
 
-    return run(arguments)
+        return run(arguments)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 __all__ = ["main"]

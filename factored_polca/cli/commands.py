@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import resource
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
-from factored_polca.cli.source import Source, load, parse_memory, parse_state
+from factored_polca.cli.source import Source, UsageError, load, parse_actions, parse_state
+from factored_polca.models import LimitReached
 
-STARTED = time.perf_counter()
+SMALLEST_STORE = 1 << 20
+"""Bytes without which no model fits."""
 
 
 def peak_memory_bytes() -> int:
@@ -40,10 +45,20 @@ def compile_kernels(output: Output, solver: bool) -> float:
 
 
 def limits(arguments: argparse.Namespace) -> tuple[int | None, float | None]:
-    """The bytes the diagrams may take, and the time at which to stop."""
+    """The bytes the diagrams may take, and the time at which to stop.
+
+    Raises:
+        LimitReached: the program without any diagrams takes more memory than that.
+    """
     memory = None
     if arguments.memory is not None:
-        memory = max(32 << 20, parse_memory(arguments.memory) - current_memory_bytes())
+        taken = current_memory_bytes()
+        memory = arguments.memory - taken
+        if memory < SMALLEST_STORE:
+            raise LimitReached(
+                f"the program itself takes {taken / 2**20:,.0f} MiB, which leaves too little of --memory "
+                f"{arguments.memory / 2**20:,.0f} MiB for diagrams; give more"
+            )
     deadline = None if arguments.time is None else time.monotonic() + arguments.time
     return memory, deadline
 
@@ -62,10 +77,10 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.symbolic.reach import reachable_states
 
     source = load(arguments.model, arguments.set)
+    actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
     report_warnings(source, output)
     compile_seconds = compile_kernels(output, solver=False)
     memory, deadline = limits(arguments)
-    actions = None if arguments.actions is None else [a.strip() for a in arguments.actions.split(",")]
     data: dict[str, Any] = {"model": source.model.name, "states": source.model.states}
     began = time.perf_counter()
     with output.progress(f"minimising {source.name}"):
@@ -113,7 +128,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
             "seconds": certificate.seconds,
         }
         status = 0 if certificate.ok else 1
-    data["total_seconds"] = time.perf_counter() - STARTED
+    data["total_seconds"] = time.perf_counter() - arguments.began
     data["peak_memory_bytes"] = peak_memory_bytes()
     if arguments.json:
         output.result(data)
@@ -147,6 +162,21 @@ def print_minimisation(data: dict[str, Any], output: Output) -> None:
         output.line(f"[red]{escape(failure)}[/]")
 
 
+def refuse_unwritable(path: str) -> None:
+    """Find out before the work, not after it, that its result can't be written.
+
+    Raises:
+        UsageError: no such folder, or a folder in the file's place.
+    """
+    folder = Path(path).absolute().parent
+    if not folder.is_dir():
+        raise UsageError(f"{path}: there is no folder {folder}; make it first")
+    if Path(path).is_dir():
+        raise UsageError(f"{path} is a folder; name a file in it")
+    if not os.access(folder, os.W_OK):
+        raise UsageError(f"{path}: the folder {folder} can't be written to")
+
+
 def plan(arguments: argparse.Namespace, output: Output) -> int:
     """Plan a hierarchy, print the table, write the plan."""
     from factored_polca.hierarchy.executable import executable
@@ -155,6 +185,8 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.hierarchy.plan_file import save_plan
     from factored_polca.hierarchy.report import plan_report
 
+    if arguments.output is not None:
+        refuse_unwritable(arguments.output)
     source = load(arguments.model, arguments.set, arguments.tasks)
     report_warnings(source, output)
     compile_seconds = compile_kernels(output, solver=True)
@@ -181,7 +213,7 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     data |= {
         "parse_seconds": source.parse_seconds,
         "compile_seconds": compile_seconds,
-        "total_seconds": time.perf_counter() - STARTED,
+        "total_seconds": time.perf_counter() - arguments.began,
         "peak_memory_bytes": peak_memory_bytes(),
     }
     for warning in found.warnings:
@@ -204,15 +236,15 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
 def print_plan(data: dict[str, Any], output: Output) -> None:
     """The figures of `plan` for people."""
     columns = {
-        "task": "left", "actions": "right", "blocks": "right", "Q-values": "right",
-        "classes": "right", "shared": "right", "value": "right", "time": "right",
+        "task": "left", "actions": "right", "blocks": "right", "Q-values": "right", "classes": "right",
+        "shared": "right", "value": "right", "time": "right",
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
+        value = "none" if row["value"] == -math.inf else f"{row['value']:.6g}"
         table.add_row(
-            escape(row["name"]), f"{len(row['actions']):,}", f"{row['blocks']:,}", f"{row['q_values']:,}",
-            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", f"{row['value']:.6g}",
-            seconds(row["seconds"]),
+            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}", f"{row['q_values']:,}",
+            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", value, seconds(row["seconds"]),
         )  # fmt: skip
     table.add_section()
     total = data["totals"]
@@ -221,6 +253,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
+    output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
     output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
     if data["flat_value"] is None:
         output.line(f"flat optimum: {escape(data['flat_note'])}")

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 import sys
+import time
+import traceback
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 
+from factored_polca import __version__
 from factored_polca.models.errors import LimitReached, ModelError
 
 DESCRIPTION = """Plan factored Markov decision processes with task hierarchies: each subtask is
@@ -31,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    top.add_argument("--version", action="version", version=f"factored-polca {installed_version()}")
+    top.add_argument("--version", action="version", version=f"factored-polca {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, text: str) -> argparse.ArgumentParser:
@@ -52,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
 
     def with_limits(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
-        sub.add_argument("--memory", metavar="SIZE", help="memory limit, such as 2GB")
+        sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit, such as 2GB")
         sub.add_argument("--time", type=positive, metavar="SECONDS", help="time limit")
         sub.add_argument("--order", default="auto", choices=ORDERS, help="order of the diagrams' variables")
         sub.add_argument("--reachable", action="store_true", help="only states that the start can reach")
@@ -71,7 +74,9 @@ def parser() -> argparse.ArgumentParser:
     with_limits(sub)
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
-    sub.add_argument("--solver", default="auto", help="auto, vi, pi or mpi, for tasks that name none")
+    sub.add_argument(
+        "--solver", default="auto", choices=("auto", "vi", "pi", "mpi"), help="for tasks that name none"
+    )
     sub.add_argument("--no-flat", action="store_true", help="leave out the flat optimum")
     sub.add_argument(
         "--flat-blocks", type=natural, default=100_000, metavar="N",
@@ -82,9 +87,9 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--state", required=True, metavar="x=3,y=2,...", help="a value for each feature")
     sub = command("simulate", "Run a plan on the original model.")
     sub.add_argument("plan", metavar="PLAN")
-    sub.add_argument("--episodes", type=natural, default=1000, metavar="N", help="1000 if not given")
+    sub.add_argument("--episodes", type=counting, default=1000, metavar="N", help="1000 if not given")
     sub.add_argument(
-        "--steps", type=natural, metavar="T", help="steps an episode; by the discount if not given"
+        "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
     sub = command("convert", "Write a model in another format, chosen by the extension.")
@@ -94,6 +99,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 ORDERS = ("auto", "file", "force", "spectral")
+SOLVERS = ("auto", "vi", "pi", "mpi")
 
 
 def natural(text: str) -> int:
@@ -101,6 +107,25 @@ def natural(text: str) -> int:
     if not text.isdecimal() or len(text) > 15:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number")
     return int(text)
+
+
+def counting(text: str) -> int:
+    """A whole number from 1 on."""
+    value = natural(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("it must be at least 1")
+    return value
+
+
+UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+
+
+def size(text: str) -> int:
+    """`2GB`, `500MiB` or a plain number of bytes."""
+    match = re.fullmatch(r"\s*([0-9]{1,15}(?:\.[0-9]{1,9})?)\s*([kmgt]|[kmg]i)?b?\s*", text.lower())
+    if match is None or float(match[1]) <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 2GB or 500MiB")
+    return int(float(match[1]) * UNITS[match[2] or ""])
 
 
 def positive(text: str) -> float:
@@ -112,14 +137,6 @@ def positive(text: str) -> float:
     if not 0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
     return value
-
-
-def installed_version() -> str:
-    """The version of the installed package."""
-    try:
-        return version("factored-polca")
-    except PackageNotFoundError:
-        return "unknown (not installed)"
 
 
 def commands() -> dict[str, Callable[..., int]]:
@@ -136,23 +153,35 @@ def commands() -> dict[str, Callable[..., int]]:
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command; answer its exit status."""
+    began = time.perf_counter()
     try:
-        parsed = parser().parse_args(arguments)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    try:
-        return guarded(parsed)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+        try:
+            parsed = parser().parse_args(arguments)
+            parsed.began = began
+            return guarded(parsed)
+        except SystemExit as stop:
+            return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        finally:
+            sys.stdout.flush()
     except BrokenPipeError:
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        close_output()
         return 1
 
 
+def close_output() -> None:
+    """Send what is still to be written nowhere, as nobody reads it; `| head` is no error."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
 def guarded(parsed: argparse.Namespace) -> int:
-    """Run the command; turn the errors that users can mend into messages and exit statuses."""
+    """Run the command; turn errors into messages and exit statuses, without a traceback.
+
+    What no one can mend but us is said too, with the status 1; with the variable
+    FACTORED_POLCA_TRACEBACK set it comes with the traceback that a report of the fault needs.
+    """
     from factored_polca.cli.output import Output
     from factored_polca.cli.source import UsageError
     from factored_polca.diagrams import Aborted, MemoryLimit
@@ -177,3 +206,11 @@ def guarded(parsed: argparse.Namespace) -> int:
     except MemoryError:
         output.error("limit reached: out of memory; give --memory to stop earlier and more gently")
         return 3
+    except Exception as error:
+        if os.environ.get("FACTORED_POLCA_TRACEBACK"):
+            traceback.print_exc()
+        output.error(
+            f"a fault of factored-polca, not of your input: {type(error).__name__}: {error}; please report "
+            "it with what FACTORED_POLCA_TRACEBACK=1 prints"
+        )
+        return 1

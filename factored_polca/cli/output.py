@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any
 
+from rich import markup
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.status import Status
 from rich.table import Table
+
+PIPE_WIDTH = 200
+"""Columns of a table that goes to a file or a pipe, where nobody told COLUMNS."""
 
 
 class Output:
@@ -130,7 +134,7 @@ def make_table(title: str, columns: Mapping[str, str]) -> Table:
     """
     table = Table(
         title=escape(title), title_justify="left", title_style="bold", header_style="bold",
-        box=box.SIMPLE_HEAD, pad_edge=False,
+        box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True, show_edge=False,
     )  # fmt: skip
     for heading, side in columns.items():
         table.add_column(

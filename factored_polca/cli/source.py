@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +10,6 @@ from pathlib import Path
 from factored_polca import library
 from factored_polca.formats import FORMATS, read
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, Value
-
-_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 
 
 class UsageError(Exception):
@@ -67,7 +64,9 @@ def read_tasks(text: str, model: Model) -> TaskHierarchy:
     path = Path(text)
     try:
         content = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except FileNotFoundError:
+        raise ModelError(f"{text}: there is no such file; --tasks takes a .toml file") from None
+    except (OSError, ValueError) as error:
         raise ModelError(f"{text}: can't be read ({error})") from None
     try:
         return read_native_tasks(content, model)
@@ -90,16 +89,18 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
     return result
 
 
-def parse_memory(text: str) -> int:
-    """`2GB`, `500MiB` or a plain number of bytes.
+def parse_actions(text: str, model: Model) -> list[str]:
+    """`a,b` as the names of actions, in the model's order.
 
     Raises:
-        UsageError: anything else.
+        UsageError: an unknown action; the message lists those there are.
     """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]i?)?b?\s*", text.lower())
-    if match is None or float(match[1]) <= 0 or len(match[1]) > 18:
-        raise UsageError(f"--memory takes a size such as 2GB or 500MiB, not {text!r}")
-    return int(float(match[1]) * _UNITS[match[2] or ""])
+    asked = {name.strip() for name in text.split(",")}
+    known = [action.name for action in model.actions]
+    unknown = sorted(asked - set(known))
+    if unknown:
+        raise UsageError(f"--actions: no action {unknown[0]!r}; there are {', '.join(known[:50])}")
+    return [name for name in known if name in asked]
 
 
 def parse_state(text: str, model: Model) -> dict[str, Value]:

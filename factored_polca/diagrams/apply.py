@@ -23,6 +23,7 @@ from factored_polca.diagrams.jit import inline, int64, kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
+    INVALID,
     STEPS,
     YIELDED,
     Int32Array,
@@ -48,25 +49,26 @@ _S32 = np.uint64(32)
 _LOW = np.uint64(0xFFFFFFFF)
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
+_NAN = np.float64(np.nan).view(np.uint64)
+
+
+@inline
+def float_payload(value: float) -> np.uint64:
+    """The payload of a float: without -0.0 and with one NaN."""
+    if value != value:
+        return _NAN
+    return np.float64(value + 0.0).view(np.uint64)
 
 
 @kernel
 def leaf_value(code: int, x: np.uint64, y: np.uint64, prime: np.uint64, inverse: np.uint64) -> np.uint64:
-    """The payload of op(x, y) for payloads x, y."""
+    """The payload of op(x, y) for payloads x, y; conditions need none, see `shortcut`."""
     if code == FIELD_ADD:
         return field_add(x, y, prime)
     if code == FIELD_SUBTRACT:
         return field_subtract(x, y, prime)
     if code == FIELD_MULTIPLY:
         return field_multiply(x, y, prime, inverse)
-    if AND <= code <= DIFFERENCE:
-        if code == AND:
-            return x & y
-        if code == OR:
-            return x | y
-        if code == XOR:
-            return x ^ y
-        return x & (y ^ _ONE)
     a = np.uint64(x).view(np.float64)
     b = np.uint64(y).view(np.float64)
     if code == FLOAT_LESS:
@@ -83,12 +85,15 @@ def leaf_value(code: int, x: np.uint64, y: np.uint64, prime: np.uint64, inverse:
         a = min(a, b)
     else:
         a = max(a, b)
-    return np.float64(a + 0.0).view(np.uint64)
+    return float_payload(a)
 
 
 @inline
 def shortcut(op: Int64Array, a: int, b: int) -> Any:
-    """The node op(a, b) where the operator's row decides it, else 0."""
+    """The node op(a, b) where the operator's row decides it, else 0.
+
+    It decides all that a condition's leaves 0 and 1 can be.
+    """
     if a == b and op[SAME] != 0:
         if op[SAME] < 0:
             return a
@@ -147,10 +152,11 @@ def apply_binary(
             if k == 1:
                 break
         elif k == arity[level]:
-            r = find_or_add(pool, head, unique, arity, level, results, rp - arity[level])
+            r = find_or_add(pool, head, unique, arity, int64(level), results, rp - arity[level])
             if r < 0:
                 state[0] = sp
                 state[1] = rp
+                head[2] += STEPS - budget
                 return FULL
             i = 4 * cache_index(key, a, b, mask)
             cache[i] = a
@@ -174,6 +180,8 @@ def apply_binary(
             if la == leaf_level and lb == leaf_level:
                 if code == EQUAL:
                     value = _ZERO
+                elif AND <= code <= DIFFERENCE:
+                    return INVALID
                 elif code == PAIR:
                     value = (np.uint64(a) << _S32) | np.uint64(b)
                 else:
@@ -184,6 +192,7 @@ def apply_binary(
                 if r < 0:
                     state[0] = sp
                     state[1] = rp
+                    head[2] += STEPS - budget
                     return FULL
             else:
                 if op[COMMUTES] != 0 and a > b:
@@ -239,10 +248,11 @@ def choose(
             if k == 1:
                 break
         elif k == arity[level]:
-            r = find_or_add(pool, head, unique, arity, level, results, rp - arity[level])
+            r = find_or_add(pool, head, unique, arity, int64(level), results, rp - arity[level])
             if r < 0:
                 state[0] = sp
                 state[1] = rp
+                head[2] += STEPS - budget
                 return FULL
             i = 8 * (cache_index(c, a, b, mask))
             cache[i] = a
@@ -266,6 +276,8 @@ def choose(
             r = b
         elif a == false:
             r = c
+        elif pool[a] == len(arity) - 1:
+            return INVALID
         elif b == true and c == false:
             r = a
         else:

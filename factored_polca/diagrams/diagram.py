@@ -25,7 +25,10 @@ class Diagram:
         self.leaf_type = leaf_type
 
     def __del__(self) -> None:
-        self.manager.release(self._slot)
+        try:  # noqa: SIM105 (called for each handle: no context manager)
+            self.manager.release(self._slot)
+        except AttributeError:  # Ctrl-C came before `__init__` had set them
+            pass
 
     @property
     def node(self) -> int:

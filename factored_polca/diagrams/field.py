@@ -114,9 +114,17 @@ def random_prime(generator: random.Random) -> int:
 
 @dataclass(frozen=True)
 class Field:
-    """GF(p).  `encode` and `decode` go between integers mod p and their stored form."""
+    """GF(p).  `encode` and `decode` go between integers mod p and their stored form.
+
+    Raises:
+        ValueError: `prime` is no prime in [2^60, 2^61).
+    """
 
     prime: int = MERSENNE_61
+
+    def __post_init__(self) -> None:
+        if not 2**60 < self.prime < 2**61 or not is_prime(self.prime):
+            raise ValueError(f"{self.prime} is no prime in [2^60, 2^61); use MERSENNE_61 or random_prime")
 
     @cached_property
     def parameters(self) -> UInt64Array:
@@ -147,7 +155,7 @@ class Field:
         return self.encode(value.numerator % self.prime * pow(denominator, -1, self.prime))
 
     def draw(self, generator: np.random.Generator, count: int) -> UInt64Array:
-        """`count` distinct random non-zero elements in stored form."""
+        """`count` distinct random non-zero elements in stored form [count]."""
         drawn = generator.integers(1, self.prime, size=count, dtype=np.uint64)
         while len(np.unique(drawn)) < count:
             drawn = generator.integers(1, self.prime, size=count, dtype=np.uint64)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final
 
 import numpy as np
@@ -22,8 +23,9 @@ from factored_polca.diagrams.leaves import FLOAT, INDEX, LeafType, describe
 from factored_polca.diagrams.nodes import (
     DONE,
     FIRST,
+    FULL,
+    INVALID,
     STEPS,
-    YIELDED,
     Int32Array,
     Int64Array,
     compact,
@@ -64,33 +66,39 @@ class Manager:
     Args:
         sizes: the number of values of the variable at each level, the top one first.
         memory_limit: bytes for nodes and caches together; three quarters of the free memory if None.
+        first_nodes: for about how many nodes there is room before the store first grows.
     """
 
-    def __init__(self, sizes: Sequence[int], *, memory_limit: int | None = None) -> None:
+    def __init__(
+        self, sizes: Sequence[int], *, memory_limit: int | None = None, first_nodes: int = 1 << 14
+    ) -> None:
         if len(sizes) > MAXIMUM_LEVELS:
             raise ValueError(f"{len(sizes)} levels; at most {MAXIMUM_LEVELS} are possible")
         if any(size < 1 for size in sizes):
             raise ValueError("every variable needs at least one value")
         self.sizes: tuple[int, ...] = tuple(int(size) for size in sizes)
         self.leaf_level = len(self.sizes)
-        self.memory_limit = memory_limit or available_memory() * 3 // 4
+        self.memory_limit = available_memory() * 3 // 4 if memory_limit is None else memory_limit
         self.deadline: float | None = None
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0
         self._abort = False
-        self._pinned = 0
-        self._collect_at = 1 << 22
+        self._undisturbed = False
         self._fields: dict[int, int] = {}
+        self._keys: dict[tuple[Hashable, ...], int] = {}
+        self.operator_rows: dict[tuple[str, LeafType], Int64Array] = {}
+        self.walks = 0
 
         self.arity: Int32Array = np.array([*self.sizes, 2], dtype=np.int32)
-        self.pool: Int32Array = np.zeros(1 << 16, dtype=np.int32)
+        room = 1 << max(4, (first_nodes - 1).bit_length())
+        self.pool: Int32Array = np.zeros(4 * room, dtype=np.int32)
         self.head: Int64Array = np.array([FIRST, 0, 0], dtype=np.int64)
-        self.unique: Int32Array = np.zeros(1 << 14, dtype=np.int32)
-        self.cache: Int32Array = np.zeros(4 << 13, dtype=np.int32)
-        self.choice_cache: Int32Array = np.zeros(8 << 10, dtype=np.int32)
-        self.slots: Int64Array = np.zeros(2 << 12, dtype=np.int64)
-        self.ring: Int32Array = np.zeros(1 << 16, dtype=np.int32)
+        self.unique: Int32Array = np.zeros(room, dtype=np.int32)
+        self.cache: Int32Array = np.zeros(2 * room, dtype=np.int32)
+        self.choice_cache: Int32Array = np.zeros(room // 2, dtype=np.int32)
+        self.slots: Int64Array = np.zeros(room // 2, dtype=np.int64)
+        self.ring: Int32Array = np.zeros(4 * room, dtype=np.int32)
         self.ring_state: Int64Array = np.zeros(1, dtype=np.int64)
         self.roots: Int32Array = np.zeros(1 << 8, dtype=np.int32)
         self._free = list(range(len(self.roots) - 1, -1, -1))
@@ -101,6 +109,8 @@ class Manager:
         self.results: Int32Array = np.zeros(sum(self.sizes) + 2 * widest + levels, dtype=np.int32)
         self.words: Int32Array = np.zeros(widest, dtype=np.int32)
         self.terms: Int32Array = np.zeros(2 * widest * levels, dtype=np.int32)
+        self._live = FIRST
+        self._plan_collection()
 
     # -- handles ---------------------------------------------------------------------------
 
@@ -155,6 +165,10 @@ class Manager:
         """A small number for a field, for keys of caches."""
         return self._fields.setdefault(field.prime, len(self._fields) + 1)
 
+    def cache_key(self, *parts: Hashable) -> int:
+        """A number for what `parts` name, to mark entries of `cache`; operators' keys are positive."""
+        return -1 - self._keys.setdefault(parts, len(self._keys))
+
     # -- running kernels -------------------------------------------------------------------
 
     def abort(self) -> None:
@@ -167,41 +181,70 @@ class Manager:
         Raises:
             Aborted: one of them is there.
         """
+        if self._undisturbed:
+            return
         if self._abort:
             self._abort = False
             raise Aborted("the computation was aborted")
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise Aborted("the time limit was reached")
 
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Inside, aborts and the deadline wait: for what is left to do after one of them came."""
+        before, self._undisturbed = self._undisturbed, True
+        try:
+            yield
+        finally:
+            self._undisturbed = before
+
     def run(self, step: Callable[[], int]) -> None:
-        """Call the resumable kernel `step` until it is done, growing the store as it asks."""
+        """Call the resumable kernel `step` until it is done, growing the store as it asks.
+
+        Raises:
+            ValueError: a condition has a leaf that is neither 0 nor 1.
+            MemoryLimit, Aborted: see there; the store is as good as before.
+        """
         while True:
             code = step()
             if code == DONE:
                 return
-            if code == YIELDED:
-                self.pause()
-            else:
+            if code == INVALID:
+                raise ValueError("a condition needs leaves 0 and 1; make one of other leaves with relabel")
+            self.pause()
+            if code == FULL:
                 self.grow()
 
     def safe_point(self) -> None:
         """Collect garbage if it is time; called before an operation, when all nodes in use have handles."""
         self.pause()
-        if self.head[0] > self._collect_at and not self._pinned:
+        if self.head[0] > self._collect_at:
             self.collect_garbage()
-            self._collect_at = max(1 << 22, 2 * int(self.head[0]))
+
+    def _plan_collection(self) -> None:
+        """Collect when the store has doubled, earlier where the memory limit is near."""
+        room = len(self.pool)
+        if self.bytes + 4 * (2 * room) <= self.memory_limit:
+            room *= 2
+        self._collect_at = min(max(1 << 22, 2 * self._live), (self._live + room) // 2)
 
     def collect_garbage(self) -> None:
-        """Drop every node that no diagram reaches; all handles stay valid, caches are emptied."""
+        """Drop every node that no diagram reaches; all handles stay valid, caches are emptied.
+
+        Everything that names nodes without a handle is emptied first: Ctrl-C between two of these
+        statements does no harm.
+        """
         self._note_peak()
-        compact(self.pool, self.head, self.arity, self.roots, np.empty(2 * self.leaf_level + 4, np.int32))
-        self.unique[:] = 0
-        rehash(self.pool, self.head, self.unique, self.arity)
+        self.collections += 1
+        self.operator_rows.clear()
         self.cache[:] = 0
         self.choice_cache[:] = 0
         self.slots[:] = 0
         self.ring_state[0] = 0
-        self.collections += 1
+        stack = np.empty(2 * self.leaf_level + 4, np.int32)
+        compact(self.pool, self.head, self.unique, self.arity, self.roots, stack)
+        self._live = int(self.head[0])
+        self._plan_collection()
 
     def grow(self) -> None:
         """Make room for more nodes.
@@ -217,14 +260,17 @@ class Manager:
             pool = np.empty(size, dtype=np.int32)
             pool[: self.head[0]] = self.pool[: self.head[0]]
             self.pool = pool
+            self._plan_collection()
         if 3 * self.head[1] >= 2 * len(self.unique):
             self._claim(8 * len(self.unique))
-            self.unique = np.zeros(2 * len(self.unique), dtype=np.int32)
-            rehash(self.pool, self.head, self.unique, self.arity)
+            unique = np.zeros(2 * len(self.unique), dtype=np.int32)
+            rehash(self.pool, self.head, unique, self.arity)
+            self.unique = unique  # only now: Ctrl-C may have come while it was being filled
             self._grow_caches()
 
     def _claim(self, new_bytes: int, possible: bool = True) -> None:
         if not possible or self.bytes + new_bytes > self.memory_limit:
+            self._collect_at = 0  # the next operation collects what this one leaves behind
             raise MemoryLimit(
                 f"{int(self.head[1]):,} nodes fill the memory limit of {self.memory_limit / 2**20:,.0f} MiB"
             )
@@ -286,6 +332,9 @@ class Manager:
             count += 1
         assert count == self.head[1], "the number of nodes is wrong"
 
+    def __reduce__(self) -> tuple[object, ...]:
+        raise TypeError("managers are not pickled; use factored_polca.diagrams.dump and load")
+
     def __repr__(self) -> str:
         return (
             f"<Manager: {self.leaf_level} levels, {self.node_count:,} nodes, {self.bytes / 2**20:.0f} MiB>"
@@ -296,8 +345,10 @@ def require(diagrams: Sequence[Diagram], leaf_type: LeafType | None = None) -> M
     """The common manager of `diagrams`.
 
     Raises:
-        ValueError: two managers, two leaf types, or another leaf type than asked for.
+        ValueError: no diagrams, two managers, two leaf types, or another leaf type than asked for.
     """
+    if not diagrams:
+        raise ValueError("at least one diagram is needed")
     manager = diagrams[0].manager
     wanted = diagrams[0].leaf_type if leaf_type is None else leaf_type
     for diagram in diagrams:

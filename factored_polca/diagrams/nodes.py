@@ -27,8 +27,9 @@ Int64Array = npt.NDArray[np.int64]
 FIRST = 4
 """Offset of the first node; smaller numbers are free to mean other things."""
 
-DONE, FULL, YIELDED = 0, 1, 2
-"""What a resumable kernel answers: finished; the store is full; its budget of steps is used up."""
+DONE, FULL, YIELDED, INVALID = 0, 1, 2, 3
+"""What a resumable kernel answers: finished; the store is full; its budget of steps is used up; a
+condition has a leaf that is neither 0 nor 1."""
 
 STEPS = 1 << 21
 """Steps that a resumable kernel takes before it hands control back, so that Ctrl-C is seen."""
@@ -51,7 +52,10 @@ def find_or_add(
     pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
     level: int, words: Int32Array, base: int,
 ) -> Any:  # fmt: skip
-    """The node at `level` with children (or payload halves) words[base:]; -1 if there is no room."""
+    """The node at `level` with children (or payload halves) words[base:]; -1 if there is no room.
+
+    Kernels pass an int64 `level`: each other type would be compiled anew.
+    """
     d = arity[level]
     if level < len(arity) - 1:
         first = words[base]
@@ -137,11 +141,13 @@ def payload(pool: Int32Array, leaf: int) -> np.uint64:
 
 @kernel
 def compact(
-    pool: Int32Array, head: Int64Array, arity: Int32Array, roots: Int32Array, stack: Int32Array
-) -> None:
-    """Drop every node that no root reaches, move the others down, renumber `roots`.
+    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    roots: Int32Array, stack: Int32Array,
+) -> None:  # fmt: skip
+    """Drop every node that no root reaches, move the others down, renumber `roots`, rehash.
 
-    Marks and new offsets are kept in the scratch word: 0 for a dead node.
+    Marks and new offsets are kept in the scratch word: 0 for a dead node.  All of it is one kernel,
+    so that Ctrl-C can't come between and leave roots or table behind.
     """
     leaf_level = len(arity) - 1
     n = int64(FIRST)
@@ -199,6 +205,9 @@ def compact(
         n += size
     head[0] = new
     head[1] = count
+    for i in range(len(unique)):
+        unique[i] = 0
+    rehash(pool, head, unique, arity)
 
 
 @kernel
@@ -214,7 +223,7 @@ def insert_all(
         if levels[i] < leaf_level:
             for k in range(arity[levels[i]]):
                 words[k] = out[children[first[i] + k]]
-            r = find_or_add(pool, head, unique, arity, levels[i], words, 0)
+            r = find_or_add(pool, head, unique, arity, int64(levels[i]), words, 0)
             if r < 0:
                 return FULL
             out[i] = r

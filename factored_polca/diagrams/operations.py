@@ -21,7 +21,7 @@ from factored_polca.diagrams.field import Field
 from factored_polca.diagrams.leaves import FLOAT, INDEX, FloatLeaves, LeafType, payloads
 from factored_polca.diagrams.manager import Manager, require
 from factored_polca.diagrams.nodes import STEPS, Int32Array, find_or_add
-from factored_polca.diagrams.operators import OPERATORS, Kind
+from factored_polca.diagrams.operators import OPERATORS, Kind, OperatorRow
 from factored_polca.diagrams.walk import collect, rebuild
 from factored_polca.diagrams.weighted import run_weighted_sum
 
@@ -30,9 +30,11 @@ _NO_FIELD = np.array([3, 1], dtype=np.uint64)
 
 def node(manager: Manager, level: int, children: Sequence[Diagram]) -> Diagram:
     """The diagram that branches at `level` to `children`; see `Manager.variable`."""
+    require_level(manager, level)
     if len(children) != manager.sizes[level]:
         raise ValueError(f"{len(children)} children at level {level}, which has {manager.sizes[level]}")
-    require(children)
+    if require(children) is not manager:
+        raise ValueError("the children are diagrams of another manager; dump and load them")
     manager.safe_point()
     if any(child.level <= level for child in children):
         raise ValueError(f"a child of a node at level {level} must be below that level")
@@ -43,6 +45,16 @@ def node(manager: Manager, level: int, children: Sequence[Diagram]) -> Diagram:
         if made < 0:
             manager.grow()
     return manager.handle(made, children[0].leaf_type)
+
+
+def require_level(manager: Manager, level: int) -> None:
+    """Refuse what is no level.
+
+    Raises:
+        ValueError: there is no such level.
+    """
+    if not 0 <= level < manager.leaf_level:
+        raise ValueError(f"level {level}; levels are 0 to {manager.leaf_level - 1}")
 
 
 def _kind(leaf_type: LeafType) -> Kind:
@@ -66,21 +78,31 @@ def apply(name: str, a: Diagram, b: Diagram) -> Diagram:
     manager.safe_point()
     result_type = INDEX if row.gives == "boolean" else a.leaf_type
     field = a.leaf_type.parameters if isinstance(a.leaf_type, Field) else _NO_FIELD
+    op = manager.operator_rows.get((name, a.leaf_type))
+    if op is None:
+        op = manager.operator_rows[name, a.leaf_type] = _kernel_row(manager, row, a.leaf_type, result_type)
+    return manager.handle(_run_binary(manager, op, field, a, b), result_type)
+
+
+def _kernel_row(
+    manager: Manager, row: OperatorRow, leaf_type: LeafType, result_type: LeafType
+) -> npt.NDArray[np.int64]:
+    """The operator for the kernel; its leaves have no handles, so the next collection drops it."""
 
     def leaf(value: float | None, leaf_type: LeafType) -> int:
         return 0 if value is None else manager.constant(value, leaf_type).node
 
     op = np.zeros(8, dtype=np.int64)
     op[codes.CODE] = row.code
-    op[codes.LEFT_IDENTITY] = leaf(row.left_identity, a.leaf_type)
-    op[codes.RIGHT_IDENTITY] = leaf(row.right_identity, a.leaf_type)
-    op[codes.LEFT_ABSORBING] = leaf(row.left_absorbing, a.leaf_type)
-    op[codes.RIGHT_ABSORBING] = leaf(row.right_absorbing, a.leaf_type)
+    op[codes.LEFT_IDENTITY] = leaf(row.left_identity, leaf_type)
+    op[codes.RIGHT_IDENTITY] = leaf(row.right_identity, leaf_type)
+    op[codes.LEFT_ABSORBING] = leaf(row.left_absorbing, leaf_type)
+    op[codes.RIGHT_ABSORBING] = leaf(row.right_absorbing, leaf_type)
     op[codes.COMMUTES] = row.commutes
     op[codes.SAME] = -1 if row.same == "argument" else leaf(row.same, result_type)
-    number = manager.field_number(a.leaf_type) if isinstance(a.leaf_type, Field) else 0
+    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else 0
     op[codes.KEY] = row.code + 64 * number
-    return manager.handle(_run_binary(manager, op, field, a, b), result_type)
+    return op
 
 
 def _run_binary(
@@ -162,13 +184,16 @@ def leaf_payloads(manager: Manager, nodes: Int32Array) -> npt.NDArray[np.uint64]
 class Walk:
     """The nodes of one diagram, collected: children first, leaves by first occurrence.
 
-    Valid until the next operation on the manager; it pins the manager against garbage collection
-    only while its own methods run.
+    Valid until the next garbage collection, that is until the next operation with a safe point.
+    `manager.pool[node + 1]` is a node's number in the walk until another walk begins.
     """
 
     def __init__(self, diagram: Diagram) -> None:
         manager = self.manager = diagram.manager
         self.diagram = diagram
+        self._collections = manager.collections
+        manager.walks += 1
+        self._number = manager.walks
         nodes = np.empty(int(manager.head[1]) + 1, dtype=np.int32)
         stack = np.empty(2 * manager.leaf_level + 4, dtype=np.int32)
         count = collect(manager.pool, manager.arity, diagram.node, nodes, stack)
@@ -182,7 +207,18 @@ class Walk:
 
     def leaf_payloads(self) -> npt.NDArray[np.uint64]:
         """The payloads of the leaves by first occurrence."""
+        self._refresh()
         return leaf_payloads(self.manager, self.leaves())
+
+    def _refresh(self) -> None:
+        """Number the nodes again where another walk came between."""
+        manager = self.manager
+        if self._collections != manager.collections:
+            raise RuntimeError("a walk does not outlive a garbage collection; walk the diagram again")
+        if self._number != manager.walks:
+            manager.walks += 1
+            self._number = manager.walks
+            manager.pool[self.nodes + 1] = np.arange(len(self.nodes), dtype=np.int32)
 
     def map_indices(self, images: npt.NDArray[Any], leaf_type: LeafType) -> Diagram:
         """Replace leaf i of an index diagram by the value (or stored form) `images[i]`."""
@@ -197,6 +233,7 @@ class Walk:
     ) -> Diagram:
         """Rebuild with new leaves (by first occurrence), levels fixed to a value, levels moved."""
         manager = self.manager
+        self._refresh()
         fixed_child = np.full(manager.leaf_level + 1, -1, dtype=np.int32)
         level_map = np.arange(manager.leaf_level + 1, dtype=np.int32)
         for level, value in (fixed or {}).items():
@@ -224,9 +261,9 @@ def substitute_leaves(
     """Replace each leaf value by `function` of it; for a field the values are integers mod p."""
     diagram.manager.safe_point()
     target = diagram.leaf_type if leaf_type is None else leaf_type
-    walk = Walk(diagram)
-    values = (function(diagram.leaf_type.decode(int(p))) for p in walk.leaf_payloads())
-    images = np.array([target.encode(value) for value in values], dtype=np.uint64)
+    old = [diagram.leaf_type.decode(int(p)) for p in Walk(diagram).leaf_payloads()]
+    images = np.array([target.encode(function(value)) for value in old], dtype=np.uint64)
+    walk = Walk(diagram)  # only now: `function` may have used the manager
     if isinstance(target, FloatLeaves):
         return walk.with_leaves(images.view(np.float64), target)
     return walk.with_leaves(images, target)
@@ -251,6 +288,7 @@ def restrict(diagram: Diagram, values: Mapping[int, int]) -> Diagram:
     """The cofactor where each level in `values` has the given value."""
     manager = diagram.manager
     for level, value in values.items():
+        require_level(manager, level)
         if not 0 <= value < manager.sizes[level]:
             raise ValueError(f"value {value} at level {level}, which has {manager.sizes[level]} values")
     manager.safe_point()
@@ -268,6 +306,8 @@ def move(diagram: Diagram, levels: Mapping[int, int]) -> Diagram:
         ValueError: the new levels do not keep the order, or the numbers of values differ.
     """
     manager = diagram.manager
+    for level in {*levels, *levels.values()}:
+        require_level(manager, level)
     tested = support(diagram)
     targets = [levels.get(level, level) for level in tested]
     if targets != sorted(set(targets)):
@@ -290,7 +330,11 @@ def support(diagram: Diagram) -> list[int]:
 
 
 def choose(condition: Diagram, then: Diagram, otherwise: Diagram) -> Diagram:
-    """`then` where `condition` is true, `otherwise` elsewhere."""
+    """`then` where `condition` is true, `otherwise` elsewhere.
+
+    Raises:
+        ValueError: diagrams that do not fit together, or a condition with leaves other than 0 and 1.
+    """
     manager = require((then, otherwise))
     require((condition, condition), INDEX)
     if condition.manager is not manager:
@@ -323,10 +367,15 @@ def sum_options(manager: Manager, leaf_type: LeafType, normalised: bool) -> npt.
 def weighted_sum(
     weights: Sequence[Diagram], terms: Sequence[Diagram], *, normalised: bool = False
 ) -> Diagram:
-    """sum_v weights[v] * terms[v], pointwise, as one recursion.
+    """sum_v weights[v] * terms[v], pointwise, as one recursion; 0 times infinity is 0.
 
     With `normalised` the weights must sum to 1 everywhere (a conditional distribution).
+
+    Raises:
+        ValueError: no terms, not one weight for each, or diagrams that do not fit together.
     """
+    if len(weights) != len(terms):
+        raise ValueError(f"{len(weights)} weights for {len(terms)} terms; each term needs one weight")
     manager = require([*weights, *terms])
     leaf_type = terms[0].leaf_type
     manager.safe_point()
@@ -353,6 +402,7 @@ def weighted_sum(
 
 def cofactors(diagram: Diagram, level: int) -> list[Diagram]:
     """The restriction to each value of the variable at `level`."""
+    require_level(diagram.manager, level)
     return [restrict(diagram, {level: v}) for v in range(diagram.manager.sizes[level])]
 
 

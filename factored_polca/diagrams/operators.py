@@ -1,7 +1,8 @@
 """The table of binary operators: one row each, and one loop in the tests checks every row.
 
 A row names the kernel's code, the leaf type it takes, its identities and absorbing elements (as
-values), whether it commutes, what it gives on equal arguments, and its textbook definition.
+values), whether it commutes, what it gives on equal arguments, and its textbook definition.  As in
+measure theory 0 times infinity is 0: what has probability 0 does not count.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ OPERATORS: Final[dict[tuple[str, Kind], OperatorRow]] = {
         _symmetric("times", "field", codes.FIELD_MULTIPLY, lambda a, b: a * b, 1, 0),
         _symmetric("plus", "float", codes.FLOAT_ADD, lambda a, b: a + b, 0),
         OperatorRow("minus", "float", codes.FLOAT_SUBTRACT, lambda a, b: a - b, right_identity=0),
-        _symmetric("times", "float", codes.FLOAT_MULTIPLY, lambda a, b: a * b, 1, 0),
+        _symmetric("times", "float", codes.FLOAT_MULTIPLY, lambda a, b: a * b if a and b else 0.0, 1, 0),
         _symmetric("minimum", "float", codes.FLOAT_MINIMUM, min, same="argument"),
         _symmetric("maximum", "float", codes.FLOAT_MAXIMUM, max, same="argument"),
         OperatorRow("less", "float", codes.FLOAT_LESS, lambda a, b: a < b, same=0, gives="boolean"),

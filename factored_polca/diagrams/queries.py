@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from factored_polca.diagrams.diagram import Diagram
 from factored_polca.diagrams.field import MERSENNE_61, Field, is_prime
-from factored_polca.diagrams.leaves import LeafType
+from factored_polca.diagrams.leaves import FLOAT, LeafType
+from factored_polca.diagrams.leaves import payloads as leaf_payloads_of
 from factored_polca.diagrams.manager import Manager
 from factored_polca.diagrams.nodes import Int32Array, insert_all
-from factored_polca.diagrams.operations import Walk, leaf_payloads
+from factored_polca.diagrams.operations import Walk, leaf_payloads, support
 from factored_polca.diagrams.walk import count_states, evaluate, first_states
 
 
@@ -36,12 +37,21 @@ def evaluate_states(diagram: Diagram, states: npt.NDArray[Any], columns: Sequenc
 
     Returns:
         uint64 payloads [row]; for index leaves they are the values, floats are to be viewed.
+
+    Raises:
+        ValueError: a level that is tested has no column, or a state a value it can't have.
     """
     manager = diagram.manager
     table = np.ascontiguousarray(states, dtype=np.int32)
+    if table.ndim != 2 or len(columns) != manager.leaf_level:
+        raise ValueError(
+            f"states are an array [row, column], columns one for each of {manager.leaf_level} levels"
+        )
     out = np.empty(len(table), dtype=np.int32)
     columns_array = np.asarray([*columns, 0], dtype=np.int32)
-    evaluate(manager.pool, manager.arity, diagram.node, table, columns_array, out)
+    done = evaluate(manager.pool, manager.arity, diagram.node, table, columns_array, out)
+    if done < len(table):
+        raise ValueError(f"row {done}, {table[done].tolist()}, lacks a column or has a value out of range")
     return leaf_payloads(manager, out)
 
 
@@ -50,10 +60,14 @@ def at(diagram: Diagram, values: Mapping[int, int]) -> int | float:
 
     Raises:
         KeyError: the diagram tests a level without a value.
+        ValueError: the variable at a level has no such value.
     """
     manager, node = diagram.manager, diagram.node
-    while manager.pool[node] < manager.leaf_level:
-        node = int(manager.pool[node + 2 + values[int(manager.pool[node])]])
+    while (level := int(manager.pool[node])) < manager.leaf_level:
+        value = values[level]
+        if not 0 <= value < manager.sizes[level]:
+            raise ValueError(f"value {value} at level {level}, which has {manager.sizes[level]} values")
+        node = int(manager.pool[node + 2 + value])
     payload = int(leaf_payloads(manager, np.array([node], dtype=np.int32))[0])
     return diagram.leaf_type.decode(payload)
 
@@ -63,8 +77,13 @@ def states_of_leaves(diagram: Diagram, levels: Sequence[int]) -> list[int]:
 
     Counting runs modulo as many 61-bit primes as the number of states needs, and the Chinese
     remainder theorem puts the counts together.
+
+    Raises:
+        ValueError: the diagram tests a level that is not given.
     """
     manager = diagram.manager
+    if missing := sorted(set(support(diagram)) - set(levels)):
+        raise ValueError(f"the diagram tests levels {missing}; count states over all levels it tests")
     counted = [manager.sizes[i] if i in set(levels) else 1 for i in range(manager.leaf_level)]
     total = 1
     for size in counted:
@@ -106,6 +125,7 @@ def states_for_leaves(diagram: Diagram) -> Int32Array:
     manager = diagram.manager
     count = int(Walk(diagram).is_leaf.sum())
     states = np.zeros((count, manager.leaf_level), dtype=np.int32)
+    manager.walks += 1
     nodes = np.empty(int(manager.head[1]) + 1, dtype=np.int32)
     stack = np.empty(2 * manager.leaf_level + 4, dtype=np.int32)
     first_states(manager.pool, manager.arity, diagram.node, nodes, stack, states)
@@ -127,15 +147,24 @@ def dump(diagram: Diagram) -> dict[str, npt.NDArray[Any]]:
     return {"levels": walk.levels.copy(), "children": children, "leaves": walk.leaf_payloads()}
 
 
+def _integers(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> npt.NDArray[np.int64]:
+    """One of the arrays that `dump` writes, checked to be a list of integers."""
+    if name not in arrays:
+        raise ValueError(f"a dumped diagram has arrays levels, children and leaves; {name!r} is missing")
+    array = np.asarray(arrays[name])
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise ValueError(f"the diagram's {name} must be a list of integers")
+    return array.astype(np.int64)
+
+
 def load(manager: Manager, arrays: Mapping[str, npt.NDArray[Any]], leaf_type: LeafType) -> Diagram:
     """The diagram that `dump` wrote, in a manager with variables of the same sizes.
 
     Raises:
         ValueError: the arrays are no diagram over these variables.
     """
-    levels = np.ascontiguousarray(arrays["levels"], dtype=np.int32)
-    children = np.ascontiguousarray(arrays["children"], dtype=np.int32)
-    payloads = np.ascontiguousarray(arrays["leaves"], dtype=np.uint64)
+    levels, children, stored = (_integers(arrays, name) for name in ("levels", "children", "leaves"))
+    payloads = leaf_payloads_of(leaf_type, stored.view(np.float64 if leaf_type == FLOAT else np.uint64))
     if len(levels) == 0 or levels.min() < 0 or levels.max() > manager.leaf_level:
         raise ValueError("the diagram has levels that the model has not")
     is_leaf = levels == manager.leaf_level
@@ -148,6 +177,7 @@ def load(manager: Manager, arrays: Mapping[str, npt.NDArray[Any]], leaf_type: Le
         children.min() < 0 or (children >= owner).any() or (levels[children] <= levels[owner]).any()
     ):
         raise ValueError("the diagram's nodes are not ordered")
+    levels32, children32 = levels.astype(np.int32), children.astype(np.int32)
     manager.safe_point()
     out = np.zeros(len(levels), dtype=np.int32)
     out[is_leaf] = manager.leaf_nodes(payloads)
@@ -156,7 +186,7 @@ def load(manager: Manager, arrays: Mapping[str, npt.NDArray[Any]], leaf_type: Le
     def step() -> int:
         m = manager
         return insert_all(
-            m.pool, m.head, m.unique, m.arity, levels, first, children, out, m.words, progress
+            m.pool, m.head, m.unique, m.arity, levels32, first, children32, out, m.words, progress
         )
 
     manager.run(step)

@@ -66,7 +66,7 @@ def rebuild(
             else:
                 for k in range(arity[level]):
                     words[k] = images[pool[pool[node + 2 + k] + 1]]
-                r = find_or_add(pool, head, unique, arity, level_map[level], words, 0)
+                r = find_or_add(pool, head, unique, arity, int64(level_map[level]), words, 0)
                 if r < 0:
                     return FULL
                 images[progress[0]] = r
@@ -78,16 +78,27 @@ def rebuild(
 def evaluate(
     pool: Int32Array, arity: Int32Array, root: int, states: Int32Array, columns: Int32Array,
     out: Int32Array,
-) -> None:  # fmt: skip
-    """The leaf of each state; `states[row, columns[level]]` is the value at a level."""
+) -> int:  # fmt: skip
+    """The leaf of each state; `states[row, columns[level]]` is the value at a level.
+
+    Answers the number of rows done: fewer than there are where a row has no such column or value.
+    """
     leaf_level = len(arity) - 1
+    width = states.shape[1]
     for row in range(len(states)):
         node = int64(root)
         level = pool[node]
         while level < leaf_level:
-            node = int64(pool[node + 2 + states[row, columns[level]]])
+            column = int64(columns[level])
+            if column < 0 or column >= width:
+                return row
+            value = int64(states[row, column])
+            if value < 0 or value >= arity[level]:
+                return row
+            node = int64(pool[node + 2 + value])
             level = pool[node]
         out[row] = node
+    return len(states)
 
 
 @kernel

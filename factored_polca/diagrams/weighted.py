@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.apply import cache_index
+from factored_polca.diagrams.apply import cache_index, float_payload
 from factored_polca.diagrams.field import field_add, field_multiply
 from factored_polca.diagrams.jit import inline, int64, kernel
 from factored_polca.diagrams.nodes import (
@@ -139,7 +139,7 @@ def settle(
         for j in range(kept):
             weight = np.uint64(payload(pool, terms[base + 2 * j])).view(np.float64)
             total += weight * np.uint64(payload(pool, terms[base + 2 * j + 1])).view(np.float64)
-        value = np.float64(total + 0.0).view(np.uint64)
+        value = float_payload(total)
     else:
         for j in range(kept):
             product = field_multiply(
@@ -170,8 +170,7 @@ def run_weighted_sum(
     rp = state[1]
     budget = state[2]
     while sp > 0:
-        budget -= 1
-        if budget < 0:
+        if budget <= 0:
             state[0] = sp
             state[1] = rp
             state[2] = STEPS
@@ -180,13 +179,14 @@ def run_weighted_sum(
         f = 5 * (sp - 1)
         base = int64(stack[f])
         count = int64(stack[f + 1])
+        budget -= count
         level = stack[f + 2]
         k = stack[f + 3]
         if level < 0:
             if k == 1:
                 break
         elif k == arity[level]:
-            r = find_or_add(pool, head, unique, arity, level, results, rp - arity[level])
+            r = find_or_add(pool, head, unique, arity, int64(level), results, rp - arity[level])
             if r < 0:
                 state[0] = sp
                 state[1] = rp

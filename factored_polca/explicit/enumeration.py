@@ -96,9 +96,11 @@ def _number_memo(model: Model, expression: Expression) -> NumberMemo:
 
     def compute(x: Assignment) -> Fraction | Undefined:
         value = evaluate(expression, x, parameters)
+        if isinstance(value, bool):  # a condition counts as 0 or 1
+            return Fraction(int(value))
         if isinstance(value, (Fraction, Undefined)):
             return value
-        shown = describe(value) if isinstance(value, (bool, str)) else "a distribution"
+        shown = describe(value) if isinstance(value, str) else "a distribution"
         return Undefined(f"a number is needed, not {shown}")
 
     return _Memo(expression, compute)

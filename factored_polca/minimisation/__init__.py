@@ -1,5 +1,6 @@
 """Exact model minimisation on diagrams: criterion, partition, refinement, quotient, the way back."""
 
+from factored_polca.minimisation.certify import Certificate, certify
 from factored_polca.minimisation.criterion import Choice, DecisionProcess, flat_process
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.quotient import Quotient, make_quotient
@@ -7,12 +8,14 @@ from factored_polca.minimisation.reduction import Reduction, reduce
 from factored_polca.minimisation.refine import Minimisation, minimise
 
 __all__ = [
+    "Certificate",
     "Choice",
     "DecisionProcess",
     "Minimisation",
     "Partition",
     "Quotient",
     "Reduction",
+    "certify",
     "flat_process",
     "make_quotient",
     "minimise",

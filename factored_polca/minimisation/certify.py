@@ -8,9 +8,9 @@ terminal flag and applicable choices, and for each applicable choice c
 (a stochastic bisimulation: Dean & Givan 1997; Givan, Dean & Greig 2003).  That makes its quotient
 exact.  That it is the *coarsest* such partition is another question, which is not asked here.
 
-Each block's indicator is regressed by itself through each choice, modulo several fixed primes; a
-function is constant on every block exactly where it equals the partition relabelled by the
-function's values at the representatives, and equality of two diagrams is equality of two nodes.
+Each block's indicator is regressed through each choice, modulo several fixed primes.  A function is
+constant on every block exactly where it equals the partition relabelled by the function's values at
+the representatives, and equality of two diagrams is equality of two nodes.
 
 How many primes: let p, q be the primitives that c stands for at x and y, D_p the product over
 features of the least common denominators of their rows, so T_p(x, k) = n / D_p with 0 <= n <= D_p, and
@@ -57,6 +57,7 @@ from factored_polca.minimisation.criterion import (
     reward_denominator,
     row_denominator,
 )
+from factored_polca.minimisation.indicators import Indicators
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import make_plan, push_exact, row_table, rows_at
 from factored_polca.minimisation.quotient import exact_rewards, primitives_at
@@ -66,7 +67,7 @@ from factored_polca.symbolic import NumericView
 Int32Array = npt.NDArray[np.int32]
 
 Progress = Callable[[int, int], None]
-"""Called after each block with the number of checks made and the number there will be."""
+"""Called after each choice with the number of checks made and the number there will be."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +110,19 @@ def certify(
         failure_limit: stop after so many failures.
 
     Raises:
-        LimitReached: memory or time; `partial` is a certificate of the checks so far, not `ok`.
+        LimitReached: memory or time; `partial` is a certificate of the checks so far, not `ok` (None
+            before the first check).
         ValueError: a partition of another model, or a limit below 1.
     """
     if partition.symbolic.manager is not process.symbolic.manager:
         raise ValueError("the partition belongs to another compiled model than the process")
     if failure_limit < 1:
         raise ValueError(f"failure_limit is {failure_limit}; it must be at least 1")
-    check = _Check(process, partition, failure_limit, progress)
+    try:
+        check = _Check(process, partition, failure_limit, progress)
+    except (MemoryLimit, Aborted) as error:
+        text = f"certification stopped before the first check: {error}"
+        raise LimitReached(text, "certification") from None
     try:
         for failure in check.run():
             check.failures.append(failure)
@@ -219,27 +225,30 @@ class _Check:
                 yield self.describe(found, f"the reward of {choice.name} is {here} and {there}")
 
     def transitions(self, view: ProcessView, number: int) -> Iterator[str]:
-        choices = [
-            (c, choice)
-            for c, choice in enumerate(self.process.choices)
-            if number < self.primes_for(self.row_bits[c])
-        ]
+        """T_c(x, k) for all choices and blocks modulo one prime, one choice after the other."""
+        wanted = [c for c in range(len(self.process.choices)) if number < self.primes_for(self.row_bits[c])]
         field = view.numbers.leaf_type
         assert isinstance(field, Field)
-        for block in self.leaves if choices else ():
-            self.manager.pause()
-            indicator = np.zeros(max(self.leaves) + 1, dtype=np.uint64)
-            indicator[block] = field.encode(1)
-            value = relabel(self.labels, indicator, field)
-            memo: dict[int, Diagram] = {}
-            for c, choice in choices:
-                entered = view.regress(choice, value, memo)
+        if not wanted:
+            return
+        indicators = Indicators(self.labels, self.leaves, field)
+        regressed: dict[int, list[Diagram]] = {}
+        for place, c in enumerate(wanted):
+            choice = self.process.choices[c]
+            for primitive in choice.primitives:
+                if primitive not in regressed:
+                    regressed[primitive] = indicators.regress(view.numbers, primitive)
+            for k, block in enumerate(self.leaves):
+                self.manager.pause()
+                entered = view.select(choice, {p: regressed[p][k] for p in choice.primitives})
                 found = self.differing(entered, zero=block == self.outside)
                 if found is not None and (c, block) not in self.known:
                     self.known.add((c, block))
                     yield self.describe_row(choice, block, found)
             if self.progress is not None:
                 self.progress(self.checks, self.planned)
+            later = {p for d in wanted[place + 1 :] for p in self.process.choices[d].primitives}
+            regressed = {p: parts for p, parts in regressed.items() if p in later}
 
     def differing(self, function: Diagram, zero: bool = False) -> Int32Array | None:
         """Two states [2, level] of one block where `function` differs, or None.
@@ -330,7 +339,7 @@ def _prime_below(bound: int) -> int:
 
 
 def fixed_primes(bits: int, denominator: int) -> tuple[int, ...]:
-    """The largest primes below 2^61 that do not divide `denominator`; their product has over `bits` bits."""
+    """The largest primes below 2^61 that do not divide `denominator`; their product exceeds 2^bits."""
     primes: list[int] = []
     prime = MERSENNE_61
     while 60 * len(primes) < bits:

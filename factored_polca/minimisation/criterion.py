@@ -104,7 +104,8 @@ class ProcessView:
             self._rewards[primitive] = total
         return self._rewards[primitive]
 
-    def _select(self, choice: Choice, parts: dict[int, Diagram]) -> Diagram:
+    def select(self, choice: Choice, parts: dict[int, Diagram]) -> Diagram:
+        """The part of the primitive that the choice stands for, 0 where it is not applicable."""
         result = self.numbers.zero
         for primitive, part in parts.items():
             result = choose(choice.where(primitive), part, result)
@@ -112,7 +113,7 @@ class ProcessView:
 
     def reward(self, choice: Choice) -> Diagram:
         """R_c(x), 0 where the choice is not applicable."""
-        return self._select(choice, {p: self._primitive_reward(p) for p in choice.primitives})
+        return self.select(choice, {p: self._primitive_reward(p) for p in choice.primitives})
 
     def regress(self, choice: Choice, value: Diagram, memo: dict[int, Diagram]) -> Diagram:
         """sum_x' T_c(x, x') V(x'), 0 where the choice is not applicable.
@@ -122,7 +123,7 @@ class ProcessView:
         for primitive in choice.primitives:
             if primitive not in memo:
                 memo[primitive] = self.numbers.regress(primitive, value)
-        return self._select(choice, {p: memo[p] for p in choice.primitives})
+        return self.select(choice, {p: memo[p] for p in choice.primitives})
 
 
 def policy_primitives(policy: Diagram, defined: Diagram, count: int) -> tuple[int, ...]:

@@ -229,14 +229,19 @@ def rows_at(
     return result
 
 
+PAIRS = 1 << 19
+"""Pairs that `push_floats` writes before it hands control back."""
+
+
 @kernel
 def push_floats(
     roots: Int32Array, slot: Int32Array, first_child: Int64Array, children: Int32Array,
     leaf: Int64Array, start: Int64Array, value: Int32Array, probability: FloatArray,
     chosen: Int32Array, row_ends: Int64Array, blocks: Int64Array, masses: FloatArray, state: Int64Array,
 ) -> int:  # fmt: skip
-    """Write the rows of states state[0].. as (block, mass) pairs; answer 1 if the room ran out.
+    """Write the rows of states state[0].. as (block, mass) pairs.
 
+    Answers 0 when done, 1 if the room ran out, 2 after `PAIRS` pairs, so that Ctrl-C is seen.
     `state` is [next row, pairs written].  Places are numbered level by level; a binary heap yields the
     touched ones in that order, so a place has all its mass when it is taken.
     """
@@ -249,7 +254,10 @@ def push_floats(
             largest = leaf[q]
     total = np.zeros(largest + 1, np.float64)
     touched = np.empty(largest + 1, np.int64)
+    pause_at = state[1] + PAIRS
     while state[0] < len(chosen):
+        if state[1] >= pause_at:
+            return 2
         row = state[0]
         size = 0
         ends = 0

@@ -164,6 +164,8 @@ def push_states(
         )  # fmt: skip
         if code == 0:
             break
+        if code == 2:
+            continue
         more = max(len(blocks), partition.blocks)
         blocks = np.concatenate([blocks, np.empty(more, dtype=np.int64)])
         masses = np.concatenate([masses, np.empty(more, dtype=np.float64)])

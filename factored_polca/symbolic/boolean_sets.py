@@ -13,9 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Diagram, MemoryLimit
 from factored_polca.diagrams.operations import Walk
 from factored_polca.symbolic.model import SymbolicModel
+
+LEAST_MEMORY = 1 << 26
+"""Bytes that CUDD may use however low the manager's limit is."""
 
 
 class BooleanSets:
@@ -29,6 +32,9 @@ class BooleanSets:
         self.library, self._module = _load(library)
         self.bdd: Any = self._module.BDD()
         self.bdd.configure(reordering=False)
+        self.memory_limit = max(LEAST_MEMORY, self.manager.memory_limit)
+        if self.library == "dd.cudd":
+            self.bdd.configure(max_memory=self.memory_limit)
         self.bits: list[list[str]] = [
             [f"{'xy'[level % 2]}{level // 2}_{bit}" for bit in range((size - 1).bit_length())]
             for level, size in enumerate(self.manager.sizes)
@@ -37,12 +43,21 @@ class BooleanSets:
         self.bdd.declare(*self._level)
 
     @contextmanager
-    def deep(self) -> Iterator[None]:
-        """Room for the recursion of `dd.autoref`, which goes one call deeper for each bit."""
+    def running(self) -> Iterator[None]:
+        """Room for the recursion of `dd.autoref`, which goes one call deeper for each bit.
+
+        Raises:
+            MemoryLimit: in place of the null pointer that CUDD answers at its limit.
+        """
         before = sys.getrecursionlimit()
         sys.setrecursionlimit(max(before, 1_000 + 10 * len(self._level)))
         try:
             yield
+        except ValueError as error:
+            if "NULL" not in str(error):
+                raise
+            limit = f"{self.memory_limit / 2**20:,.0f} MiB"
+            raise MemoryLimit(f"the sets of states fill the memory limit of {limit}") from None
         finally:
             sys.setrecursionlimit(before)
 

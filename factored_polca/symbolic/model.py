@@ -216,9 +216,7 @@ class _Build:
     @classmethod
     def again(cls, symbolic: SymbolicModel) -> _Build:
         """To compile further parts of a finished model."""
-        return cls(
-            symbolic.model, symbolic.order, symbolic.positions, symbolic.manager, symbolic.compiler
-        )
+        return cls(symbolic.model, symbolic.order, symbolic.positions, symbolic.manager, symbolic.compiler)
 
     def finish(self) -> SymbolicModel:
         terminal = self.condition(self.model.terminal, ("terminal",), self.true)
@@ -280,7 +278,7 @@ class _Build:
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
         terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
         terms = [(expression, where) for expression, where in terms if expression != ZERO]
-        sampled = tuple(self.sampled_term(expression, where, app) for expression, where in terms)
+        sampled = tuple(self.sampled_term(expression, where, app, rows) for expression, where in terms)
         rewards = tuple(self.expected(term, rows, elimination) for term in sampled)
         return SymbolicAction(action.name, rows, elimination, app, rewards, sampled)
 
@@ -370,9 +368,11 @@ class _Build:
         where: Diagram,
     ) -> Term:
         """A reward term with its expectation over x' taken."""
-        return self.expected(self.sampled_term(expression, path, where), rows, elimination)
+        return self.expected(self.sampled_term(expression, path, where, rows), rows, elimination)
 
-    def sampled_term(self, expression: Expression, path: tuple[str, ...], where: Diagram) -> Term:
+    def sampled_term(
+        self, expression: Expression, path: tuple[str, ...], where: Diagram, rows: dict[int, RowDiagram]
+    ) -> Term:
         """A reward term as a function of (x, x'); a condition counts as 0 or 1."""
         compiled = self.compiler.compile(expression)
         bad = np.array(

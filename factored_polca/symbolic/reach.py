@@ -103,7 +103,7 @@ def reachable_states(
         reached, iterations = _closure(symbolic, _KernelSets(relations), start)
     else:
         sets = BooleanSets(symbolic)
-        with sets.deep():
+        with sets.running():
             reached, iterations = _closure(symbolic, _LibrarySets(sets, symbolic, relations), start)
     counts = dict(zip(leaves(reached), states_of_leaves(reached, symbolic.now_levels), strict=True))
     return Reachable(reached, counts.get(1, 0), iterations, backend)

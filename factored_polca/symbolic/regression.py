@@ -126,8 +126,7 @@ class NumericView:
                 handles.extend(self.weights(action, feature))
                 if feature in self.symbolic.actions[action].rows:
                     last = max(last, self.symbolic.now(feature))
-            number = self.manager.field_number(self.leaf_type) if isinstance(self.leaf_type, Field) else 0
-            key = 1_000_003 + action * 4096 + number
+            key = self.manager.cache_key("regression", action, self.leaf_type)
             self._prepared[action] = _Prepared(handles, first, last, key)
         prepared = self._prepared[action]
         if prepared.collections != self.manager.collections:
