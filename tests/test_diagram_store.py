@@ -50,9 +50,9 @@ def shrink(manager: Manager) -> None:
     manager.collect_garbage()
     manager.pool = manager.pool[: manager.head[0]].copy()
     size = 4
-    while 3 * manager.node_count >= 2 * size:
+    while 2 * manager.node_count >= size:
         size *= 2
-    unique = np.zeros(size, dtype=np.int32)
+    unique = np.zeros(size, dtype=np.int64)
     rehash(manager.pool, manager.head, unique, manager.arity)
     manager.unique = unique
 

@@ -119,7 +119,7 @@ def cache_index(key: int, a: int, b: int, mask: int) -> int:
 
 @kernel
 def apply_binary(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array, cache: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     op: Int64Array, field: npt.NDArray[np.uint64], stack: Int32Array, results: Int32Array,
     state: Int64Array,
 ) -> int:  # fmt: skip
@@ -220,7 +220,7 @@ def apply_binary(
 
 @kernel
 def choose(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array, cache: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     true: int, false: int, stack: Int32Array, results: Int32Array, state: Int64Array,
 ) -> int:  # fmt: skip
     """If-then-else of three diagrams, the first with leaves `true` and `false`.

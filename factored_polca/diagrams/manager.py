@@ -94,7 +94,7 @@ class Manager:
         room = 1 << max(4, (first_nodes - 1).bit_length())
         self.pool: Int32Array = np.zeros(4 * room, dtype=np.int32)
         self.head: Int64Array = np.array([FIRST, 0, 0], dtype=np.int64)
-        self.unique: Int32Array = np.zeros(room, dtype=np.int32)
+        self.unique: Int64Array = np.zeros(room, dtype=np.int64)
         self.cache: Int32Array = np.zeros(2 * room, dtype=np.int32)
         self.choice_cache: Int32Array = np.zeros(room // 2, dtype=np.int32)
         self.slots: Int64Array = np.zeros(room // 2, dtype=np.int64)
@@ -108,7 +108,7 @@ class Manager:
         self.stack: Int32Array = np.zeros(5 * levels, dtype=np.int32)
         self.results: Int32Array = np.zeros(sum(self.sizes) + 2 * widest + levels, dtype=np.int32)
         self.words: Int32Array = np.zeros(widest, dtype=np.int32)
-        self.terms: Int32Array = np.zeros(2 * widest * levels, dtype=np.int32)
+        self.terms: Int32Array = np.zeros(2 * widest * levels + 2, dtype=np.int32)
         self._live = FIRST
         self._plan_collection()
 
@@ -261,9 +261,9 @@ class Manager:
             pool[: self.head[0]] = self.pool[: self.head[0]]
             self.pool = pool
             self._plan_collection()
-        if 3 * self.head[1] >= 2 * len(self.unique):
-            self._claim(8 * len(self.unique))
-            unique = np.zeros(2 * len(self.unique), dtype=np.int32)
+        if 2 * self.head[1] >= len(self.unique):
+            self._claim(16 * len(self.unique))
+            unique = np.zeros(2 * len(self.unique), dtype=np.int64)
             rehash(self.pool, self.head, unique, self.arity)
             self.unique = unique  # only now: Ctrl-C may have come while it was being filled
             self._grow_caches()

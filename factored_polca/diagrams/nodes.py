@@ -7,6 +7,9 @@ A node is its offset in `pool`.  Its record is
     pool[n + 2:] the children, one for each value of the level's variable; for a leaf the two halves
                  of its 64-bit payload
 
+A slot of the unique table holds a node in its lower half and bits of the node's hash in the upper, so
+that a search looks at the pool only where the hash agrees.
+
 Children are made before parents and compaction keeps the order, so a child's offset is always less
 than its parent's.  `head` holds [end of the pool, number of nodes, steps done].  A full pool or
 unique table is answered with -1; the caller grows it and goes on where it was.
@@ -38,6 +41,7 @@ _K1 = np.uint64(0x9E3779B97F4A7C15)
 _K2 = np.uint64(0xC2B2AE3D27D4EB4F)
 _S29 = np.uint64(29)
 _S32 = np.uint64(32)
+_NODE = np.int64(0xFFFFFFFF)
 
 
 @inline
@@ -49,7 +53,7 @@ def mix(h: np.uint64, word: int) -> np.uint64:
 
 @kernel
 def find_or_add(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     level: int, words: Int32Array, base: int,
 ) -> Any:  # fmt: skip
     """The node at `level` with children (or payload halves) words[base:]; -1 if there is no room.
@@ -71,11 +75,13 @@ def find_or_add(
         h = mix(h, words[base + k])
     mask = len(unique) - 1
     i = int64(h >> _S32) & mask
+    tag = int64(h << _S32)
     while True:
-        n = int64(unique[i])
-        if n == 0:
+        entry = unique[i]
+        if entry == 0:
             break
-        if pool[n] == level:
+        n = entry & _NODE
+        if entry - n == tag and pool[n] == level:
             same = True
             for k in range(d):
                 if pool[n + 2 + k] != words[base + k]:
@@ -85,20 +91,20 @@ def find_or_add(
                 return n
         i = (i + 1) & mask
     n = head[0]
-    if n + 2 + d > len(pool) or 3 * head[1] >= 2 * len(unique):
+    if n + 2 + d > len(pool) or 2 * head[1] >= len(unique):
         return int64(-1)
     pool[n] = level
     pool[n + 1] = 0
     for k in range(d):
         pool[n + 2 + k] = words[base + k]
-    unique[i] = n
+    unique[i] = tag | n
     head[0] = n + 2 + d
     head[1] += 1
     return n
 
 
 @kernel
-def rehash(pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array) -> None:
+def rehash(pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array) -> None:
     """Fill the empty table `unique` with every node of the pool."""
     mask = len(unique) - 1
     n = int64(FIRST)
@@ -111,13 +117,13 @@ def rehash(pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32A
         i = int64(h >> _S32) & mask
         while unique[i] != 0:
             i = (i + 1) & mask
-        unique[i] = n
+        unique[i] = int64(h << _S32) | n
         n += 2 + d
 
 
 @kernel
 def make_leaves(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     payloads: npt.NDArray[np.uint64], out: Int32Array, start: int,
 ) -> int:  # fmt: skip
     """Write the leaf of each payload from `start` on to `out`; answer how many are done."""
@@ -141,7 +147,7 @@ def payload(pool: Int32Array, leaf: int) -> np.uint64:
 
 @kernel
 def compact(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     roots: Int32Array, stack: Int32Array,
 ) -> None:  # fmt: skip
     """Drop every node that no root reaches, move the others down, renumber `roots`, rehash.
@@ -212,7 +218,7 @@ def compact(
 
 @kernel
 def insert_all(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     levels: Int32Array, first: Int64Array, children: Int32Array,
     out: Int32Array, words: Int32Array, progress: Int64Array,
 ) -> int:  # fmt: skip

@@ -381,7 +381,7 @@ def weighted_sum(
     manager.safe_point()
     options = sum_options(manager, leaf_type, normalised)
     field = leaf_type.parameters if isinstance(leaf_type, Field) else _NO_FIELD
-    needed = 2 * len(weights) * (manager.leaf_level + 3)
+    needed = 2 * len(weights) * (manager.leaf_level + 3) + 2
     buffer = manager.terms if len(manager.terms) >= needed else np.empty(needed, dtype=np.int32)
     for v, (weight, term) in enumerate(zip(weights, terms, strict=True)):
         buffer[2 * v] = weight.node

@@ -48,7 +48,7 @@ def collect(pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, s
 
 @kernel
 def rebuild(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     nodes: Int32Array, count: int, fixed: Int32Array, level_map: Int32Array,
     images: Int32Array, words: Int32Array, progress: Int64Array,
 ) -> int:  # fmt: skip

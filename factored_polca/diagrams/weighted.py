@@ -58,7 +58,7 @@ def ring_slot(terms: Int32Array, base: int, count: int, mark: int, mask: int) ->
     return int64(h >> _S32) & mask
 
 
-@kernel
+@inline
 def ring_lookup(
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array, terms: Int32Array,
     base: int, count: int, mark: int,
@@ -77,7 +77,7 @@ def ring_lookup(
     return slots[slot + 1]
 
 
-@kernel
+@inline
 def ring_insert(
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array, terms: Int32Array,
     base: int, count: int, mark: int, result: int,
@@ -100,9 +100,9 @@ def ring_insert(
     ring_state[0] += size
 
 
-@kernel
+@inline
 def settle(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     options: Int64Array, field: npt.NDArray[np.uint64], terms: Int32Array, base: int, count: int,
 ) -> tuple[int, int, int]:  # fmt: skip
     """Drop zero terms of a list; answer (result or 0 or -1 for full, terms kept, top level)."""
@@ -132,7 +132,6 @@ def settle(
         return int64(terms[base + 1]), kept, top
     if top < leaf_level:
         return int64(0), kept, top
-    words = np.empty(2, np.int32)
     value = np.uint64(0)
     if options[IS_FLOAT] != 0:
         total = 0.0
@@ -149,14 +148,15 @@ def settle(
                 field[1],
             )
             value = field_add(value, product, field[0])
-    words[0] = np.int32(value & _LOW)
-    words[1] = np.int32(value >> _S32)
-    return find_or_add(pool, head, unique, arity, leaf_level, words, 0), kept, top
+    free = base + 2 * count
+    terms[free] = np.int32(value & _LOW)
+    terms[free + 1] = np.int32(value >> _S32)
+    return find_or_add(pool, head, unique, arity, leaf_level, terms, free), kept, top
 
 
 @kernel
 def run_weighted_sum(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
     options: Int64Array, field: npt.NDArray[np.uint64],
     stack: Int32Array, terms: Int32Array, results: Int32Array, state: Int64Array,
@@ -230,7 +230,7 @@ def run_weighted_sum(
 
 @kernel
 def run_regression(
-    pool: Int32Array, head: Int64Array, unique: Int32Array, arity: Int32Array,
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
     options: Int64Array, field: npt.NDArray[np.uint64],
     stack: Int32Array, terms: Int32Array, results: Int32Array, state: Int64Array,
