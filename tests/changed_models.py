@@ -28,8 +28,9 @@ from factored_polca.models import (
     operation,
     uniform,
 )
-from factored_polca.models.expressions import Reference, same, scalar
+from factored_polca.models.expressions import Reference
 from factored_polca.models.model import replace_fields
+from factored_polca.models.scalars import same, scalar
 
 
 def replace_action(action: Action, **changes: object) -> Action:

@@ -28,7 +28,8 @@ from factored_polca.models import (
     lottery,
     operation,
 )
-from factored_polca.models.expressions import Reference, scalar
+from factored_polca.models.expressions import Reference
+from factored_polca.models.scalars import scalar
 
 NAMES = ("red", "green", "blue", "grey", "low", "high", "open", "shut")
 Leaf = Callable[[], Expression]

@@ -28,7 +28,8 @@ from factored_polca.models import (
     check_tasks,
     parse,
 )
-from factored_polca.models.expressions import Reference, Undefined
+from factored_polca.models.expressions import Reference
+from factored_polca.models.scalars import Undefined
 
 F = Fraction
 SEEDS = range(60)

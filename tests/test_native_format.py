@@ -43,7 +43,7 @@ from factored_polca.models import (
     parse,
     uniform,
 )
-from factored_polca.models.expressions import scalar
+from factored_polca.models.scalars import scalar
 
 # --------------------------------------------------------------------------------------------
 # Random models with everything in them

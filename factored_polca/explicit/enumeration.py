@@ -26,14 +26,11 @@ from factored_polca.models.expressions import (
     Constant,
     Expression,
     ExpressionLike,
-    Undefined,
-    Value,
     as_expression,
-    describe,
     references,
-    scalar,
 )
 from factored_polca.models.model import Action, Model, resolve, uniform
+from factored_polca.models.scalars import Undefined, Value, describe, scalar
 
 MAXIMUM_STATES: Final = 200_000
 """Largest number of states that is enumerated unless a caller says otherwise."""

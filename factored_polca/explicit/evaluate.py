@@ -23,16 +23,10 @@ from factored_polca.models.expressions import (
     Operation,
     Parameter,
     Reference,
-    Scalar,
     Switch,
-    Undefined,
-    Value,
-    apply_operator,
-    describe,
-    same,
-    scalar,
 )
 from factored_polca.models.features import position
+from factored_polca.models.scalars import Scalar, Undefined, Value, apply_operator, describe, same, scalar
 
 Assignment: TypeAlias = Mapping[Any, Value]
 """(name, primed) or `Reference` -> value."""

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from factored_polca.explicit.arrays import ArrayMDP
-from factored_polca.models.expressions import Value
 from factored_polca.models.features import Feature
+from factored_polca.models.scalars import Value
 
 Row: TypeAlias = dict[int, Fraction]
 """Next state -> positive probability."""

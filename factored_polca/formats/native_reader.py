@@ -19,10 +19,12 @@ from factored_polca.formats.positions import Path, scan
 from factored_polca.formats.toml_text import MAXIMUM_DIGITS, Decimal, load
 from factored_polca.models.check import MAXIMUM_FEATURES, MAXIMUM_VALUES, check, check_tasks
 from factored_polca.models.errors import Fault, ModelError
-from factored_polca.models.expressions import FALSE, Constant, Expression, Scope, Value, depth
+from factored_polca.models.expressions import FALSE, Constant, Expression, depth
 from factored_polca.models.features import Feature
 from factored_polca.models.language import number, parse
 from factored_polca.models.model import Action, InitialBelief, Model, Observation, uniform
+from factored_polca.models.scalars import Value
+from factored_polca.models.scope import Scope
 from factored_polca.models.tasks import Task, TaskHierarchy
 
 MAXIMUM_ACTIONS: Final = 100_000

@@ -16,16 +16,11 @@ from factored_polca.formats.native_reader import read_native
 from factored_polca.formats.toml_text import toml_block, toml_key, toml_string
 from factored_polca.models.check import check, check_tasks
 from factored_polca.models.errors import Fault, ModelError
-from factored_polca.models.expressions import (
-    FALSE,
-    TRUE,
-    Constant,
-    Expression,
-    Value,
-)
+from factored_polca.models.expressions import FALSE, TRUE, Constant, Expression
 from factored_polca.models.features import Feature
-from factored_polca.models.language import number_text, to_text
 from factored_polca.models.model import Action, Model, Observation, uniform
+from factored_polca.models.printing import number_text, to_text
+from factored_polca.models.scalars import Value
 from factored_polca.models.tasks import Task, TaskHierarchy
 
 WIDTH: Final = 100

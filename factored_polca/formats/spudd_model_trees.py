@@ -26,12 +26,10 @@ from factored_polca.models.expressions import (
     Lottery,
     Operation,
     Reference,
-    Value,
-    describe,
-    scalar,
 )
 from factored_polca.models.features import Feature, position
 from factored_polca.models.model import Action, InitialBelief, Model, Observation
+from factored_polca.models.scalars import Value, describe, scalar
 
 Path = tuple[str, ...]
 Leaf = Callable[[Expression, Assignment], Expression]

@@ -13,9 +13,9 @@ from itertools import count
 from typing import Final
 
 from factored_polca.formats.spudd_reader import RESERVED
-from factored_polca.models.expressions import Value, describe, scalar
 from factored_polca.models.features import Feature
 from factored_polca.models.model import Model, Observation
+from factored_polca.models.scalars import Value, describe, scalar
 
 _FULL: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _PARTIAL: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*\Z")

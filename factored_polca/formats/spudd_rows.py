@@ -15,7 +15,8 @@ from typing import Final
 
 from factored_polca.formats.spudd_trees import Assignment, ExpansionLimit, Forest, reason
 from factored_polca.models.errors import Fault
-from factored_polca.models.expressions import Constant, Expression, Reference, Value, describe, scalar
+from factored_polca.models.expressions import Constant, Expression, Reference
+from factored_polca.models.scalars import Value, describe, scalar
 
 TOLERANCE: Final = Fraction(1, 10_000)
 """A row whose sum misses 1 by less is taken to be rounded."""

@@ -8,8 +8,9 @@ from fractions import Fraction
 from typing import Final
 
 from factored_polca.formats.spudd_names import Names
-from factored_polca.models.expressions import Constant, Expression, Lottery, Reference, Switch, Value
+from factored_polca.models.expressions import Constant, Expression, Lottery, Reference, Switch
 from factored_polca.models.features import position
+from factored_polca.models.scalars import Value
 
 MAXIMUM_DIGITS: Final = 400
 """Characters of a number that readers of the language take."""

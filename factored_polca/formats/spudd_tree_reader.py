@@ -15,8 +15,9 @@ from factored_polca.formats.spudd_rows import Rows
 from factored_polca.formats.spudd_tokens import Token, Tokens
 from factored_polca.formats.spudd_trees import MAXIMUM_DEPTH, Forest
 from factored_polca.models.errors import Fault
-from factored_polca.models.expressions import Expression, Operation, Reference, Value
+from factored_polca.models.expressions import Expression, Operation, Reference
 from factored_polca.models.features import Feature
+from factored_polca.models.scalars import Value
 
 _OPERATORS: Final = {"+": "add", "*": "multiply", "-": "add", "/": "divide", "$": "divide"}
 

@@ -18,7 +18,6 @@ from fractions import Fraction
 from typing import Final
 
 from factored_polca.models.expressions import (
-    OPERATORS,
     Conditional,
     Constant,
     Expression,
@@ -26,12 +25,15 @@ from factored_polca.models.expressions import (
     Operation,
     Parameter,
     Reference,
-    Scalar,
     Switch,
+    children,
+)
+from factored_polca.models.scalars import (
+    OPERATORS,
+    Scalar,
     Undefined,
     Value,
     apply_operator,
-    children,
     describe,
     scalar,
 )

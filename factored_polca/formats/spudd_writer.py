@@ -19,12 +19,7 @@ from factored_polca.formats.spudd_text import Layout
 from factored_polca.formats.spudd_trees import Assignment, TreeLimit
 from factored_polca.models.check import check
 from factored_polca.models.errors import Fault, ModelError
-from factored_polca.models.expressions import (
-    FALSE,
-    TRUE,
-    Expression,
-    Reference,
-)
+from factored_polca.models.expressions import FALSE, TRUE, Expression, Reference
 from factored_polca.models.features import Feature
 from factored_polca.models.model import Model, Observation
 

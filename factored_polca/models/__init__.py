@@ -13,7 +13,6 @@ from factored_polca.models.expressions import (
     Parameter,
     Reference,
     Switch,
-    Value,
     as_expression,
     conditional,
     conjunction,
@@ -22,8 +21,10 @@ from factored_polca.models.expressions import (
     operation,
 )
 from factored_polca.models.features import Feature, boolean
-from factored_polca.models.language import parse, to_text
+from factored_polca.models.language import parse
 from factored_polca.models.model import Action, InitialBelief, Model, Observation, uniform
+from factored_polca.models.printing import to_text
+from factored_polca.models.scalars import Value
 from factored_polca.models.tasks import Task, TaskHierarchy, flat_task, resolve_tasks
 
 __all__ = [

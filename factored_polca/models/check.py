@@ -20,11 +20,11 @@ from factored_polca.models.expressions import (
     Switch,
     depth,
     references,
-    scalar,
     subexpressions,
 )
 from factored_polca.models.features import Feature, position
 from factored_polca.models.model import Action, Model, Observation
+from factored_polca.models.scalars import scalar
 from factored_polca.models.tasks import Task, TaskHierarchy
 
 MAXIMUM_FEATURES = 10_000

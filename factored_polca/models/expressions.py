@@ -5,7 +5,7 @@ An expression is a finite tree, immutable and compared by structure:
     e ::= c                          a constant: a rational, a truth value or the name of a value
         | x | x' | o                 a feature now, the same feature next, an observation feature
         | p                          a named parameter of the model
-        | op(e_1, ..., e_n)          an operator of `OPERATORS`
+        | op(e_1, ..., e_n)          an operator of `factored_polca.models.scalars.OPERATORS`
         | if e_0 then e_1 else e_2   only the chosen branch counts
         | switch x {v: e_v, ..., e}  a decision-tree node; `e` for the values not listed
         | {e_1: q_1, ..., e_n: q_n}  a *lottery*: value e_i with probability q_i (equal values add up)
@@ -23,202 +23,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any, Final, Union
+from typing import Any, Final
 
-Value = Union[bool, int, str]
-"""A value of a feature."""
-
-Scalar = Union[Fraction, bool, str]
-"""A value of an expression: integers are rationals here."""
-
-MAXIMUM_BITS: Final = 13_000
-"""Largest numerator or denominator, in bits: fewer than the 4300 digits that Python prints."""
-
-MAXIMUM_EXPONENT: Final = 1_000
-"""Largest absolute value of an exponent."""
-
-
-@dataclass(frozen=True, slots=True)
-class Undefined:
-    """The result of an expression that has no value, and why."""
-
-    reason: str
-
-
-def scalar(value: Value) -> Scalar:
-    """The expression value that stands for feature value `value`."""
-    if isinstance(value, (bool, str)):
-        return value
-    return Fraction(value)
-
-
-def same(a: Scalar, b: Scalar) -> bool:
-    """Whether two values of one kind are equal (`True` is not the number 1)."""
-    return type(a) is type(b) and a == b
-
-
-def describe(value: Scalar | Undefined) -> str:
-    """`value` as a person would write it."""
-    if isinstance(value, Undefined):
-        return f"undefined ({value.reason})"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, Fraction) and max(abs(value.numerator), value.denominator) >= 10**40:
-        return "a number of more than 40 digits"
-    return str(value)
-
-
-# --------------------------------------------------------------------------------------------
-# Operators
-# --------------------------------------------------------------------------------------------
-
-
-def _number(value: Fraction) -> Fraction | Undefined:
-    if max(value.numerator.bit_length(), value.denominator.bit_length()) > MAXIMUM_BITS:
-        return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
-    return value
-
-
-def _add(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    return _number(a + b)
-
-
-def _multiply(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    return _number(a * b)
-
-
-def _divide(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    if b == 0:
-        return Undefined("division by zero")
-    return _number(a / b)
-
-
-def _floor_divide(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    if b == 0:
-        return Undefined("division by zero")
-    return Fraction(a // b)
-
-
-def _modulo(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    if b == 0:
-        return Undefined("division by zero")
-    return _number(a % b)
-
-
-def _power(a: Fraction, b: Fraction) -> Fraction | Undefined:
-    if b.denominator != 1 or abs(b.numerator) > MAXIMUM_EXPONENT:
-        return Undefined(f"an exponent must be an integer of at most {MAXIMUM_EXPONENT}")
-    if a == 0 and b < 0:
-        return Undefined("division by zero")
-    bits = max(a.numerator.bit_length(), a.denominator.bit_length())
-    if bits * abs(b.numerator) > MAXIMUM_BITS:
-        return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
-    return Fraction(a ** int(b))
-
-
-@dataclass(frozen=True, slots=True)
-class Operator:
-    """A row of the operator table.
-
-    `kind` says what the arguments are: "number", "order" (numbers, gives a truth value),
-    "equality" (two values of one kind, gives a truth value) or "logic".
-    `associative` operators take any number of arguments from two on.
-    """
-
-    name: str
-    symbol: str
-    kind: str
-    arity: int
-    associative: bool = False
-    function: Callable[..., Any] | None = None
-
-
-OPERATORS: Final[Mapping[str, Operator]] = {
-    row.name: row
-    for row in (
-        Operator("add", "+", "number", 2, True, _add),
-        Operator("multiply", "*", "number", 2, True, _multiply),
-        Operator("divide", "/", "number", 2, False, _divide),
-        Operator("floor_divide", "//", "number", 2, False, _floor_divide),
-        Operator("modulo", "%", "number", 2, False, _modulo),
-        Operator("power", "**", "number", 2, False, _power),
-        Operator("negate", "-", "number", 1, False, lambda a: -a),
-        Operator("absolute", "abs", "number", 1, False, abs),
-        Operator("minimum", "min", "number", 2, True, min),
-        Operator("maximum", "max", "number", 2, True, max),
-        Operator("equal", "==", "equality", 2, False, lambda a, b: a == b),
-        Operator("not_equal", "!=", "equality", 2, False, lambda a, b: a != b),
-        Operator("less", "<", "order", 2, False, lambda a, b: a < b),
-        Operator("less_equal", "<=", "order", 2, False, lambda a, b: a <= b),
-        Operator("greater", ">", "order", 2, False, lambda a, b: a > b),
-        Operator("greater_equal", ">=", "order", 2, False, lambda a, b: a >= b),
-        Operator("and", "and", "logic", 2, True),
-        Operator("or", "or", "logic", 2, True),
-        Operator("not", "not", "logic", 1),
-    )
-}
-
-
-def _kind(value: Scalar) -> str:
-    if isinstance(value, bool):
-        return "a truth value"
-    return "a number" if isinstance(value, Fraction) else "a name"
-
-
-def _logic(name: str, values: Iterable[Scalar | Undefined]) -> bool | Undefined:
-    decides = name == "or"
-    for value in values:
-        if isinstance(value, Undefined):
-            return value
-        if not isinstance(value, bool):
-            return Undefined(f"'{name}' needs truth values, not {_kind(value)} ({describe(value)})")
-        if name == "not":
-            return not value
-        if value is decides:
-            return decides
-    return not decides
-
-
-def apply_operator(name: str, values: Iterable[Scalar | Undefined]) -> Scalar | Undefined:
-    """The value of operator `name` on `values`; `Undefined` where it has none.
-
-    `and` and `or` read from left to right and stop at the first value that decides.
-    """
-    row = OPERATORS[name]
-    if row.kind == "logic":
-        return _logic(name, values)
-    arguments: list[Scalar] = []
-    for value in values:
-        if isinstance(value, Undefined):
-            return value
-        arguments.append(value)
-    if row.kind == "equality":
-        a, b = arguments
-        if type(a) is not type(b):
-            left, right = f"{_kind(a)} ({describe(a)})", f"{_kind(b)} ({describe(b)})"
-            return Undefined(f"'{row.symbol}' compares {left} with {right}")
-    else:
-        for value in arguments:
-            if not isinstance(value, Fraction):
-                shown = f"{_kind(value)} ({describe(value)})"
-                return Undefined(f"'{row.symbol}' needs numbers, not {shown}")
-    function = row.function
-    assert function is not None
-    result: Scalar | Undefined
-    if not row.associative:
-        result = function(*arguments)
-    else:
-        result = arguments[0]
-        for value in arguments[1:]:
-            result = function(result, value)
-            if isinstance(result, Undefined):
-                return result
-    return result
-
-
-# --------------------------------------------------------------------------------------------
-# Nodes
-# --------------------------------------------------------------------------------------------
+from factored_polca.models.scalars import OPERATORS, Scalar, Undefined, Value, apply_operator
 
 
 class Operators:
@@ -332,7 +139,7 @@ class Expression(Operators):
         object.__setattr__(self, "_hash", hash((type(self).__name__, self._key())))
 
     def __str__(self) -> str:
-        from factored_polca.models.language import to_text
+        from factored_polca.models.printing import to_text
 
         return to_text(self)
 
@@ -646,46 +453,3 @@ def parts_first(root: Expression) -> list[Expression]:
         stack.append((part, True))
         stack.extend((child, False) for child in children(part))
     return order
-
-
-@dataclass(frozen=True, slots=True)
-class Scope:
-    """The names an expression may use: features, observation features, parameters, named values."""
-
-    features: frozenset[str] = frozenset()
-    observations: frozenset[str] = frozenset()
-    parameters: frozenset[str] = frozenset()
-    values: frozenset[str] = frozenset()
-    allow_next: bool = True
-
-    def resolve(self, reference: Reference) -> Expression | str:
-        """What a name stands for, or the message that it stands for nothing."""
-        name = reference.name
-        if name in self.features:
-            if reference.primed and not self.allow_next:
-                return f"{name}' (the next state) can't be used here"
-            return reference
-        if reference.primed:
-            return f"{name}' : there is no feature {name!r}; {self._known()}"
-        if name in self.observations:
-            return reference
-        if name in self.parameters:
-            return Parameter(name)
-        if name in self.values:
-            return Constant(name)
-        return f"unknown name {name!r}; {self._known()}"
-
-    def _known(self) -> str:
-        groups = (
-            ("features", self.features),
-            ("observations", self.observations),
-            ("parameters", self.parameters),
-            ("values", self.values),
-        )
-        parts = []
-        for title, names in groups:
-            if names:
-                listed = sorted(names)
-                shown = ", ".join(listed[:12]) + (", ..." if len(listed) > 12 else "")
-                parts.append(f"{title}: {shown}")
-        return "known " + "; ".join(parts) if parts else "no names are known here"

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from factored_polca.models.expressions import Constant, Operators, Reference, Scalar, Value, scalar
+from factored_polca.models.expressions import Constant, Operators, Reference
+from factored_polca.models.scalars import Scalar, Value, scalar
 
 
 @dataclass(frozen=True)

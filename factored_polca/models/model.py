@@ -27,14 +27,13 @@ from factored_polca.models.expressions import (
     Expression,
     ExpressionLike,
     Reference,
-    Scope,
-    Value,
     as_expression,
     lottery,
     rewrite,
-    scalar,
 )
 from factored_polca.models.features import Feature
+from factored_polca.models.scalars import Value, scalar
+from factored_polca.models.scope import Scope
 
 Observability = Literal["full", "partial"]
 

@@ -25,15 +25,11 @@ from factored_polca.models.expressions import (
     Operation,
     Parameter,
     Reference,
-    Scalar,
     Switch,
-    Undefined,
-    apply_operator,
-    describe,
     parts_first,
-    scalar,
 )
 from factored_polca.models.features import Feature, position
+from factored_polca.models.scalars import Scalar, Undefined, apply_operator, describe, scalar
 
 
 @dataclass(frozen=True, slots=True)

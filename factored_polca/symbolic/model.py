@@ -35,7 +35,8 @@ from factored_polca.diagrams import (
     support,
 )
 from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, check
-from factored_polca.models.expressions import ZERO, Expression, Reference, Undefined, describe, references
+from factored_polca.models.expressions import ZERO, Expression, Reference, references
+from factored_polca.models.scalars import Undefined, describe
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, row_of, used
 from factored_polca.symbolic.initial import compile_initial
 from factored_polca.symbolic.order import variable_order
