@@ -348,7 +348,8 @@ def test_markup_and_control_characters_in_names_are_shown_as_they_are(
 ) -> None:
     name = "[red]no markup[/] :smile: \x1b[31m"
     text = (
-        r'name = "[red]no markup[/] :smile: \u001b[31m"' + "\ndiscount = 0.9\nreward = 1\n[features]\n"
+        r'name = "[red]no markup[/] :smile: \u001b[31m"'
+        + "\ndiscount = 0.9\nreward = [1, 'a == \"[/]\"']\n[features]\n"
         'a = ["[bold]", "[/]"]\n[actions.go]\neffects.a = \'{"[bold]": 1/2, "[/]": 1/2}\'\n'
     )
     (folder / "odd.toml").write_text(text, encoding="utf-8")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from factored_polca.cli import commands, main
-from factored_polca.cli.main import size
+from factored_polca.cli.entry import size
 from factored_polca.diagrams import MemoryLimit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -158,8 +158,11 @@ def test_check_with_json_lists_the_faults_it_finds(
         ("", ["FEATURE=VALUE"]),
     ],
 )
-def test_a_wrong_state_is_said(fail: Fail, folder: Path, state: str, said: list[str]) -> None:
+def test_a_wrong_state_is_said(
+    fail: Fail, capsys: pytest.CaptureFixture[str], state: str, said: list[str]
+) -> None:
     assert main(["plan", "taxi", "-o", "taxi.polca", "-q", "--json", "--no-flat"]) == 0
+    capsys.readouterr()
     message = fail_quietly(fail, "act", "taxi.polca", "--state", state)
     for part in said:
         assert part in message

@@ -46,7 +46,6 @@ LONGEST_MODULE = 450
 LONGER_MODULES = {
     "formats/native_reader.py",  # one table of keys, each with its reader
     "models/expressions.py",  # the kinds of expressions and their operators, one algebra
-    "models/language.py",  # one grammar
 }
 
 

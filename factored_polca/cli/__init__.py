@@ -9,7 +9,7 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; answer the exit status (0 done, 2 wrong use or model, 3 a limit, 130 Ctrl-C)."""
     try:
-        from factored_polca.cli.main import run
+        from factored_polca.cli.entry import run
 
         return run(arguments)
     except KeyboardInterrupt:

@@ -83,7 +83,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     memory, deadline = limits(arguments)
     data: dict[str, Any] = {"model": source.model.name, "states": source.model.states}
     began = time.perf_counter()
-    with output.progress(f"minimising {source.name}"):
+    with source.located(), output.progress(f"minimising {source.name}"):
         symbolic = compile_model(
             source.model, order=arguments.order, memory_limit=memory, deadline=deadline
         )
@@ -207,7 +207,7 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
         detail = f": round {number}, {blocks:,} blocks" if blocks else ""
         output.update(f"{task}: {stage}{detail}")
 
-    with output.progress(f"planning {source.name}"):
+    with source.located(), output.progress(f"planning {source.name}"):
         found = plan_model(source.model, source.tasks, options, progress=progress)
     data = plan_report(found)
     data |= {

@@ -186,13 +186,14 @@ def print_model(data: dict[str, Any], output: Output) -> None:
 
 def check(arguments: argparse.Namespace, output: Output) -> int:
     """Check a model and its tasks completely."""
-    from factored_polca.hierarchy.check import checked
+    from factored_polca.hierarchy.check import check_undiscounted, checked
     from factored_polca.symbolic import compile_model
 
     source = load(arguments.model, arguments.set)
     faults: list[Fault] = []
     try:
-        compile_model(source.model)
+        symbolic = compile_model(source.model)
+        faults += check_undiscounted(symbolic)
     except ModelError as error:
         faults += error.faults
     if source.tasks is not None:
@@ -200,6 +201,7 @@ def check(arguments: argparse.Namespace, output: Output) -> int:
             checked(source.model, source.tasks)
         except ModelError as error:
             faults += error.faults
+    faults = list(source.locate(faults))
     if arguments.json:
         rows = [
             {"message": f.message, "path": list(f.path), "hint": f.hint, "line": f.line, "column": f.column}

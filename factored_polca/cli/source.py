@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,15 @@ class Source:
     tasks: TaskHierarchy | None
     warnings: tuple[Fault, ...]
     parse_seconds: float
+    locate: Callable[[Iterable[Fault]], tuple[Fault, ...]] = tuple
+
+    @contextmanager
+    def located(self) -> Iterator[None]:
+        """Give faults that are found inside the file, line and column of their places."""
+        try:
+            yield
+        except ModelError as error:
+            raise ModelError(self.locate(error.faults)) from None
 
 
 def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> Source:
@@ -37,9 +47,11 @@ def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> S
     parameters = parse_settings(settings)
     path = Path(text)
     warnings: tuple[Fault, ...] = ()
+    locate: Callable[[Iterable[Fault]], tuple[Fault, ...]] = tuple
     if path.is_file() or path.suffix.lower() in FORMATS or path.is_dir():
         document = read(path, parameters)
         name, model, hierarchy, warnings = path.name, document.model, document.tasks, document.warnings
+        locate = document.locate
     elif text in library.domains():
         domain = library.load(text, parameters)
         name, model, hierarchy = text, domain.model, domain.tasks
@@ -50,7 +62,7 @@ def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> S
         )
     if tasks is not None:
         hierarchy = read_tasks(tasks, model)
-    return Source(name, model, hierarchy, warnings, time.perf_counter() - began)
+    return Source(name, model, hierarchy, warnings, time.perf_counter() - began, locate)
 
 
 def read_tasks(text: str, model: Model) -> TaskHierarchy:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -93,7 +93,12 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
         document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
     except ModelError as error:
         raise error.in_file(str(path)) from None
-    return replace(document, warnings=ModelError(document.warnings).in_file(str(path)).faults)
+
+    def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
+        return ModelError(document.locate(faults)).in_file(str(path)).faults
+
+    warnings = ModelError(document.warnings).in_file(str(path)).faults
+    return replace(document, warnings=warnings, locate=locate)
 
 
 def _text(path: Path) -> str:

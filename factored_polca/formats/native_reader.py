@@ -67,7 +67,12 @@ def read_native(text: str, overrides: Mapping[str, str] | None = None, *, name: 
     if errors:
         raise reader.located(text, errors)
     warnings = reader.located(text, reader.found).faults if reader.found else ()
-    return Document(document.model, document.tasks, warnings)
+
+    def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
+        places = [_Found(fault, reader.places.get(fault.path, fault.path)) for fault in faults]
+        return reader.located(text, places).faults
+
+    return Document(document.model, document.tasks, warnings, locate)
 
 
 def read_native_tasks(text: str, model: Model) -> TaskHierarchy:
