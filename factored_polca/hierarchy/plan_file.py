@@ -15,7 +15,9 @@ import io
 import json
 import os
 import secrets
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, Final
 
@@ -110,7 +112,7 @@ def load_plan(path: str | Path, *, memory_limit: int | None = None) -> Executabl
         raise error.in_file(str(path)) from None
     except (
         zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError,
-        IndexError, OverflowError, MemoryError,
+        IndexError, OverflowError, MemoryError, AttributeError, RecursionError, struct.error, zlib.error,
     ) as error:  # fmt: skip
         reason = str(error) or type(error).__name__
         raise ModelError(f"{path}: not a plan file, or damaged ({reason})") from None
