@@ -8,11 +8,11 @@ import os
 import resource
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_actions, parse_state
+from factored_polca.formats import destination
 from factored_polca.models import LimitReached
 
 SMALLEST_STORE = 1 << 20
@@ -34,14 +34,14 @@ def current_memory_bytes() -> int:
         return peak_memory_bytes()
 
 
-def compile_kernels(output: Output, solver: bool) -> float:
+def compile_kernels(output: Output) -> float:
     """Compile or load the numeric kernels; say so where it takes long."""
     from factored_polca.hierarchy.warm import is_compiled, warm_up
 
     if is_compiled():
-        return warm_up(solver)
+        return warm_up()
     with output.progress("compiling numeric kernels, once for this installation (some 10 seconds)"):
-        return warm_up(solver)
+        return warm_up()
 
 
 def limits(arguments: argparse.Namespace) -> tuple[int | None, float | None]:
@@ -79,7 +79,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set)
     actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
     report_warnings(source, output)
-    compile_seconds = compile_kernels(output, solver=False)
+    compile_seconds = compile_kernels(output)
     memory, deadline = limits(arguments)
     data: dict[str, Any] = {"model": source.model.name, "states": source.model.states}
     began = time.perf_counter()
@@ -166,13 +166,10 @@ def refuse_unwritable(path: str) -> None:
     """Find out before the work, not after it, that its result can't be written.
 
     Raises:
-        UsageError: no such folder, or a folder in the file's place.
+        ModelError: no such folder, or no regular file in the file's place.
+        UsageError: a folder that can't be written to.
     """
-    folder = Path(path).absolute().parent
-    if not folder.is_dir():
-        raise UsageError(f"{path}: there is no folder {folder}; make it first")
-    if Path(path).is_dir():
-        raise UsageError(f"{path} is a folder; name a file in it")
+    folder = destination(path).parent
     if not os.access(folder, os.W_OK):
         raise UsageError(f"{path}: the folder {folder} can't be written to")
 
@@ -189,7 +186,7 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
         refuse_unwritable(arguments.output)
     source = load(arguments.model, arguments.set, arguments.tasks)
     report_warnings(source, output)
-    compile_seconds = compile_kernels(output, solver=True)
+    compile_seconds = compile_kernels(output)
     if source.tasks is None:
         output.note(f"{source.name} has no tasks: planning one flat task with all actions")
     memory, deadline = limits(arguments)
@@ -290,7 +287,10 @@ def act(arguments: argparse.Namespace, output: Output) -> int:
         "polled from the top", {"task": "left", "block": "right", "states in it": "right", "answer": "left"}
     )
     for poll in decision.path:
-        answer = poll.action or ("the task has ended" if poll.terminal else "no action: a dead end")
+        without = "the task has ended" if poll.terminal else "no action: a dead end"
+        if poll.block is None:
+            without = "no action: outside the states that were planned for (--reachable)"
+        answer = poll.action or without
         block = "none" if poll.block is None else f"{poll.block:,}"
         table.add_row(escape(poll.task), block, big(poll.block_states), escape(answer))
     output.table(table)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import re
 import sys
@@ -154,6 +155,7 @@ def commands() -> dict[str, Callable[..., int]]:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command; answer its exit status."""
     began = time.perf_counter()
+    prepare_streams()
     try:
         try:
             parsed = parser().parse_args(arguments)
@@ -166,6 +168,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         close_output()
         return 1
+
+
+def prepare_streams() -> None:
+    """Let output that nobody can take do no harm: closed streams, and letters an encoding lacks."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def close_output() -> None:

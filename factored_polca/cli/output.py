@@ -13,6 +13,7 @@ from typing import IO, Any
 from rich import markup
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.measure import Measurement
 from rich.status import Status
 from rich.table import Table
 
@@ -68,8 +69,13 @@ class Output:
         sys.stdout.write(text + "\n")
 
     def table(self, table: Table) -> None:
-        """Print a table on stdout."""
-        self.out.print(table)
+        """Print a table on stdout, wider than the terminal rather than with numbers cut."""
+        wide = self.out.options.update(width=100_000)
+        needed = Measurement.get(self.out, wide, table)
+        if needed.minimum <= self.out.width:
+            self.out.print(table)
+        else:
+            Console(file=self.out.file, highlight=False, emoji=False, width=needed.maximum).print(table)
 
     def line(self, text: str = "") -> None:
         """Print a line on stdout; `text` may hold markup."""

@@ -142,11 +142,30 @@ def write(document: Document | Model, path: str | Path, tasks: TaskHierarchy | N
         document = Document(document.model, tasks, document.warnings)
     try:
         text = format_of(path).write(document)
-        _replace(Path(os.path.realpath(path)), text.encode("utf-8"))
+        _replace(destination(path), text.encode("utf-8"))
     except ModelError as error:
         raise error.in_file(str(path)) from None
     except OSError as error:
         raise ModelError([Fault(f"can't be written: {_reason(error)}", file=str(path))]) from None
+
+
+def destination(path: str | Path) -> Path:
+    """The file that is written when `path` is named: links are followed, devices and pipes refused.
+
+    Raises:
+        ModelError: no such folder, or something that is no regular file stands there.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise ModelError([Fault("is a folder", hint="name a file in it", file=str(path))])
+    if target.exists() and not target.is_file():
+        hint = "only regular files are replaced"
+        raise ModelError([Fault("is a device, a pipe or a socket", hint=hint, file=str(path))])
+    if not target.parent.is_dir():
+        raise ModelError(
+            [Fault(f"there is no folder {target.parent}", hint="make it first", file=str(path))]
+        )
+    return target
 
 
 def _replace(path: Path, data: bytes) -> None:

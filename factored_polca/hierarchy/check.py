@@ -8,7 +8,7 @@ import numpy as np
 from factored_polca.minimisation import flat_process, reduce
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, check_tasks, resolve_tasks
 from factored_polca.models.tasks import Task
-from factored_polca.solvers import solve_mdp
+from factored_polca.solvers import METHODS, solve_mdp
 from factored_polca.symbolic import SymbolicModel
 
 
@@ -46,9 +46,31 @@ def checked(model: Model, hierarchy: TaskHierarchy) -> TaskHierarchy:
     """
     resolved = resolve_tasks(model, hierarchy)
     faults: list[Fault] = check_tasks(model, resolved)
+    for task in resolved.tasks:
+        try:
+            solver_of(task)
+        except ModelError as error:
+            faults += error.faults
     if faults:
         raise ModelError(faults)
     return resolved
+
+
+def solver_of(task: Task, default: str = "auto") -> str:
+    """The solver of a task, `default` where it names none.
+
+    Raises:
+        ModelError: unknown; the message lists those there are.
+    """
+    method = (task.solver or default).replace("_", " ").replace("-", " ")
+    short = {"vi": "value iteration", "pi": "policy iteration", "mpi": "modified policy iteration"}
+    method = short.get(method, method)
+    if method != "auto" and method not in METHODS:
+        listed = ", ".join(["auto", *short, *METHODS])
+        raise ModelError(
+            [Fault(f"no solver {method!r} for MDPs", ("tasks", task.name, "solver"), f"there are {listed}")]
+        )
+    return method
 
 
 def check_undiscounted(symbolic: SymbolicModel, *, block_limit: int = 100_000) -> list[Fault]:

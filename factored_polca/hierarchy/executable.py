@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import INDEX, Diagram, choose, relabel
+from factored_polca.hierarchy.check import planning_order
 from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.minimisation import Partition
 from factored_polca.models import Model, TaskHierarchy
@@ -74,3 +75,28 @@ def executable(plan: HierarchicalPlan, report: Mapping[str, Any] | None = None) 
     return ExecutablePlan(
         plan.symbolic, plan.tasks, root.task.name, policies, root.policy, dict(report or {})
     )
+
+
+def composed_policy(
+    symbolic: SymbolicModel, tasks: TaskHierarchy, policies: Mapping[str, TaskPolicy]
+) -> Diagram:
+    """The primitive action that polling the root leads to at each state, from the tasks' choices.
+
+    The leaf where there is none is the number of the model's actions.
+    """
+    manager, none = symbolic.manager, len(symbolic.actions)
+    numbers = {action.name: index for index, action in enumerate(symbolic.actions)}
+    composed: dict[str, Diagram] = {}
+    result = manager.constant(none)
+    for task in planning_order(tasks):
+        policy = policies[task.name]
+        images = np.where(policy.choice < 0, len(policy.actions), policy.choice).astype(np.uint64)
+        padded = np.append(images, np.uint64(len(policy.actions)))
+        chosen = relabel(policy.partition.diagram, padded, INDEX)
+        result = manager.constant(none)
+        for number, name in enumerate(policy.actions):
+            taken = chosen.equals(manager.constant(number))
+            below = composed[name] if name in composed else manager.constant(numbers[name])
+            result = choose(taken, below, result)
+        composed[task.name] = result
+    return result

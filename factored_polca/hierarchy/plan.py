@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, relabel
-from factored_polca.hierarchy.check import checked, planning_order
+from factored_polca.hierarchy.check import checked, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_q_values
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
@@ -34,7 +34,7 @@ from factored_polca.models import (
     TaskHierarchy,
     flat_task,
 )
-from factored_polca.solvers import METHODS, Guarantee, MDPSolution, solve_mdp
+from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 FLAT_BLOCK_LIMIT = 100_000
@@ -127,6 +127,12 @@ def plan(
         ModelError: the model or the hierarchy is not right, or a start state can't avoid a dead end.
         LimitReached: memory, blocks or time.
     """
+    if not isinstance(model, Model):
+        raise TypeError(f"plan takes a Model, not {model!r}; load_domain(NAME).model is a shipped one")
+    if tasks is not None and not isinstance(tasks, TaskHierarchy):
+        raise TypeError(
+            f"tasks are a TaskHierarchy, not {type(tasks).__name__}: TaskHierarchy([Task(...)])"
+        )
     options = options or Options()
     began = time.perf_counter()
     if model.observability != "full":
@@ -222,7 +228,7 @@ class _Planner:
         """Steps 2 to 4 of PolCA for one task."""
         began = time.perf_counter()
         self.tell(task.name, "parameterise")
-        method = solver_of(task, self.options)
+        method = solver_of(task, self.options.solver)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.reduce(task.name, process, self.options.block_limit)
         refuse_without_purpose(task, reduction.quotient.mdp)
@@ -235,7 +241,8 @@ class _Planner:
         value = expectation(reduction.project_initial(), solution.values)
         self.solved[task.name] = SolvedTask(
             task, reduction, solution, policy, defined, counts, value,
-            time.perf_counter() - began, dead, task_warnings(task, reduction, solution, dead),
+            time.perf_counter() - began, dead,
+            task_warnings(task, reduction, solution, dead, is_child=task not in self.hierarchy.roots()),
         )  # fmt: skip
         self.tell(task.name, "done", 0, reduction.partition.blocks)
 
@@ -258,7 +265,7 @@ class _Planner:
         names = tuple(action.name for action in self.symbolic.actions)
         task = root.task
         flat_already = len(self.solved) == 1 and task.actions == names and not task.has_pseudo_reward
-        if flat_already and root.reduction.process.terminal == self.symbolic.terminal:
+        if flat_already:
             return evaluate(root.reduction, root.solution), "the plan is flat"
         reachable = None
         if self.options.reachable:
@@ -266,29 +273,14 @@ class _Planner:
 
             reachable = reachable_states(self.symbolic).diagram
         try:
-            process = flat_process(self.symbolic, reachable=reachable)
+            process = flat_process(
+                self.symbolic, reachable=reachable, terminal=root.reduction.process.terminal
+            )
             reduction = self.reduce("flat optimum", process, limit)
             solution = self.optimise("flat optimum", reduction, "auto")
         except LimitReached as error:
             return None, f"left out: {error}"
         return evaluate(reduction, solution), "solved over all primitive actions"
-
-
-def solver_of(task: Task, options: Options) -> str:
-    """The solver of a task.
-
-    Raises:
-        ModelError: unknown; the message lists those there are.
-    """
-    method = (task.solver or options.solver).replace("_", " ").replace("-", " ")
-    short = {"vi": "value iteration", "pi": "policy iteration", "mpi": "modified policy iteration"}
-    method = short.get(method, method)
-    if method != "auto" and method not in METHODS:
-        listed = ", ".join(["auto", *short, *METHODS])
-        raise ModelError(
-            [Fault(f"no solver {method!r} for MDPs", ("tasks", task.name, "solver"), f"there are {listed}")]
-        )
-    return method
 
 
 def expectation(belief: np.typing.NDArray[np.float64], values: np.typing.NDArray[np.float64]) -> float:
@@ -337,7 +329,9 @@ def refuse_unavoidable_dead_ends(root: SolvedTask) -> None:
         )
 
 
-def task_warnings(task: Task, reduction: Reduction, solution: MDPSolution, dead: int) -> tuple[str, ...]:
+def task_warnings(
+    task: Task, reduction: Reduction, solution: MDPSolution, dead: int, *, is_child: bool
+) -> tuple[str, ...]:
     """What a person should know of a solved task."""
     found = []
     if dead:
@@ -349,7 +343,7 @@ def task_warnings(task: Task, reduction: Reduction, solution: MDPSolution, dead:
         found.append(
             f"task {task.name!r}: the solver stopped early ({solution.status}), gap {solution.gap:.3g}"
         )
-    if not task.has_pseudo_reward and len(task.actions) > 1 and equal_across_choices(reduction):
+    if is_child and not task.has_pseudo_reward and equal_across_choices(reduction):
         found.append(
             f"task {task.name!r}: in each state its actions have equal rewards; a pseudo_reward would tell "
             "it what to aim for"

@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import INDEX, Diagram, dump, leaves, load
-from factored_polca.formats import read_native, write_native
+from factored_polca.formats import destination, read_native, write_native
 from factored_polca.hierarchy.check import checked
-from factored_polca.hierarchy.executable import ExecutablePlan, TaskPolicy
+from factored_polca.hierarchy.executable import ExecutablePlan, TaskPolicy, composed_policy
 from factored_polca.minimisation import Partition
 from factored_polca.models import ModelError
 from factored_polca.symbolic import SymbolicModel, compile_model
@@ -43,9 +43,10 @@ def save_plan(plan: ExecutablePlan, path: str | Path) -> None:
     """Write a plan file; it appears whole or not at all.
 
     Raises:
+        ModelError: no such folder, or a device or folder in the file's place.
         OSError: the file can't be written.
     """
-    path = Path(path)
+    path = destination(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -139,8 +140,11 @@ def _read(archive: zipfile.ZipFile, memory_limit: int | None) -> ExecutablePlan:
     for number, entry in enumerate(head["tasks"]):
         policies[entry["name"]] = _read_task(archive, number, entry, symbolic)
     known = {task.name: task.actions for task in hierarchy.tasks}
-    if head["root"] not in policies or {n: p.actions for n, p in policies.items()} != known:
+    (root,) = (task.name for task in hierarchy.roots())
+    if head["root"] != root or {n: p.actions for n, p in policies.items()} != known:
         raise ValueError("the plan's tasks are not those of its model")
+    if composed_policy(symbolic, hierarchy, policies) != policy:
+        raise ValueError("the plan's policy is not what its tasks choose")
     return ExecutablePlan(symbolic, hierarchy, head["root"], policies, policy, head["report"])
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import time
 
+from factored_polca.diagrams import INDEX, dump, load, states_of_leaves
 from factored_polca.diagrams.jit import compiled_before
 from factored_polca.hierarchy.plan import Options, plan
-from factored_polca.minimisation import flat_process, minimise
 from factored_polca.models import Action, Feature, Model
-from factored_polca.symbolic import compile_model
 
 
 def tiny_model() -> Model:
@@ -28,11 +27,12 @@ def is_compiled() -> bool:
     return compiled_before()
 
 
-def warm_up(solver: bool = True) -> float:
+def warm_up() -> float:
     """Compile, or load from disk, the kernels; answer the seconds it took."""
     began = time.perf_counter()
-    if solver:
-        plan(tiny_model(), options=Options(memory_limit=1 << 28))
-    else:
-        minimise(flat_process(compile_model(tiny_model(), memory_limit=1 << 28)))
+    found = plan(tiny_model(), options=Options(memory_limit=1 << 28))
+    policy, manager = found.root.policy, found.symbolic.manager
+    states_of_leaves(policy, found.symbolic.now_levels)
+    load(manager, dump(policy), INDEX)
+    manager.collect_garbage()
     return time.perf_counter() - began

@@ -63,8 +63,11 @@ def flat_process(
     symbolic: SymbolicModel,
     actions: Sequence[str] | None = None,
     reachable: Diagram | None = None,
+    terminal: Diagram | None = None,
 ) -> DecisionProcess:
     """The decision process of the model itself, or of some of its actions.
+
+    `terminal` takes the place of the model's terminal set, which it must contain.
 
     Raises:
         KeyError: an unknown action; the message lists those there are.
@@ -75,9 +78,13 @@ def flat_process(
         if name not in names:
             raise KeyError(f"no action {name!r}; there are {', '.join(names)}")
     numbers = [names.index(name) for name in wanted]
-    choices = tuple(Choice(names[n], symbolic.actions[n].app, (n,)) for n in numbers)
     rewards = {n: symbolic.actions[n].rewards for n in numbers}
-    return DecisionProcess(symbolic, choices, symbolic.terminal, rewards, reachable)
+    if terminal is None:
+        choices = tuple(Choice(names[n], symbolic.actions[n].app, (n,)) for n in numbers)
+        return DecisionProcess(symbolic, choices, symbolic.terminal, rewards, reachable)
+    live = ~terminal
+    choices = tuple(Choice(names[n], symbolic.actions[n].app & live, (n,)) for n in numbers)
+    return DecisionProcess(symbolic, choices, terminal, rewards, reachable)
 
 
 class ProcessView:

@@ -31,7 +31,11 @@ from factored_polca.minimisation.push import (
     row_table,
     rows_at,
 )
+from factored_polca.models import Fault, ModelError
 from factored_polca.symbolic import RowDiagram
+
+LARGEST_REWARD_EXPONENT = 200
+LARGEST_REWARD = 10**LARGEST_REWARD_EXPONENT
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,18 @@ def exact_rewards(
     return [sums[index] for index in place.tolist()]
 
 
+def as_float(reward: Fraction, action: str) -> float:
+    """A reward as a float.
+
+    Raises:
+        ModelError: so large that sums of it would leave the range of floats.
+    """
+    if abs(reward) > LARGEST_REWARD:
+        message = f"action {action!r} has a reward beyond 10^{LARGEST_REWARD_EXPONENT}"
+        raise ModelError([Fault(message, ("reward",), "values are floats: scale the rewards down")])
+    return float(reward)
+
+
 def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
     """The quotient of `process` by a stable partition of it."""
     symbolic = process.symbolic
@@ -120,7 +136,7 @@ def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
         matrix = push_states(partition, rows, *plans[p], states[chosen_blocks])
         matrices[p] = (chosen_blocks, matrix)
         sums, place = distinct_rewards(process, p, states[chosen_blocks])
-        gains = np.array([float(value) for value in sums])[place]
+        gains = np.array([as_float(value, process.symbolic.actions[p].name) for value in sums])[place]
         for c in range(len(process.choices)):
             mine = primitive[c, chosen_blocks] == p
             rewards[c, chosen_blocks[mine]] = gains[mine]

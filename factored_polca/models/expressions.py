@@ -143,6 +143,10 @@ class Expression(Operators):
 
         return to_text(self)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        values = tuple(getattr(self, name) for name in self.__match_args__)  # type: ignore[attr-defined]
+        return type(self), values
+
     def __bool__(self) -> bool:
         raise TypeError(
             "an expression has no truth value in Python: combine conditions with & | ~ and "

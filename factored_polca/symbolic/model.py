@@ -224,7 +224,7 @@ class _Build:
         actions = tuple(self.action(index, terminal) for index in range(len(self.model.actions)))
         initial = compile_initial(self)
         if self.faults:
-            raise ModelError(self.faults)
+            raise ModelError(dict.fromkeys(self.faults))  # a term of all actions is wrong once
         return SymbolicModel(
             self.model, self.order, self.manager, self.compiler, terminal, actions, initial,
             positions=self.positions,
