@@ -96,6 +96,7 @@ def parser() -> argparse.ArgumentParser:
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
+    sub.add_argument("--no-tasks", action="store_true", help="leave the tasks out")
     return top
 
 

@@ -224,7 +224,7 @@ def convert(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set)
     for warning in source.warnings:
         output.warn(str(warning))
-    write(source.model, arguments.output, source.tasks)
+    write(source.model, arguments.output, None if arguments.no_tasks else source.tasks)
     if arguments.json:
         output.result({"file": arguments.output, "states": source.model.states})
     else:
