@@ -9,6 +9,9 @@ regression through choice c, masked.
     3. a confirming pass repeats 0 and 1 with fresh draws and another, random, prime; a split there
        sends the refinement on with that prime.
 
+Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
+the first `EARLY` passes after the first one are confirming passes: one without a split is the last.
+
 f_c(x) = sum_k r_k T_c(x, k) is a random linear form of the row T_c(x, .).  Equal rows give equal
 leaves, since arithmetic is exact: there is no false split, and the result is never finer than the
 coarsest stable partition.  Two rows that differ mod p get equal leaves with probability at most 1/p
@@ -20,7 +23,8 @@ and passes with probability at most
 
     B/60 / 2.7 * 10^16 + 2 / 2^60,
 
-which is reported, raised to the number of confirming rounds that passed in a row.
+which is reported, raised to the number of confirming rounds that passed in a row, times the number of
+rounds that might have been the last.
 
 A block that is not split keeps its r_k (of a block that is, one part does), so that most of V, and
 with it most cached regressions, survive from pass to pass; and a choice whose f_c is the diagram it
@@ -63,6 +67,9 @@ from factored_polca.symbolic import NumericView
 PRIMES_IN_RANGE = 2.7e16
 """A lower bound on the number of primes in [2^60, 2^61): 2^60 / ln(2^61) = 2.72e16 (Rosser &
 Schoenfeld 1962 give pi(2x) - pi(x) > 0.6 x / ln x; the density at 2^61 is 1 / 42.3)."""
+
+EARLY = 3
+"""Passes after the first that are confirming passes whatever went before."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +135,7 @@ def minimise(
             "minimisation",
             refinement.partition_so_far(),
         ) from None
-    bound = refinement.bound() ** confirmations
+    bound = refinement.bound() ** confirmations * refinement.attempts
     seconds = time.perf_counter() - start
     primes = tuple(refinement.primes)
     return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
@@ -147,6 +154,7 @@ class _Refinement:
         self.block_limit = block_limit
         self.progress = progress
         self.rounds = 0
+        self.attempts = 0
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.previous: dict[int, Diagram] = {}
@@ -170,15 +178,17 @@ class _Refinement:
 
     def run(self, confirmations: int) -> None:
         self.begin()
-        self.refine()
+        self.one_pass()
         passed = 0
         while passed < confirmations:
             self.use(Field(self.fresh_prime()))
             before = self.labels.blocks
             self.begin()
+            self.attempts += 1
             if self.one_pass() or self.labels.blocks > before:
                 passed = 0
-                self.refine()
+                if self.attempts >= EARLY:
+                    self.refine()
             else:
                 passed += 1
 
