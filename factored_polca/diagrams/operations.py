@@ -224,35 +224,46 @@ class Walk:
         """Replace leaf i of an index diagram by the value (or stored form) `images[i]`."""
         return self.with_leaves(images[self.leaf_payloads().astype(np.int64)], leaf_type)
 
-    def with_leaves(
-        self,
-        images: npt.NDArray[Any],
-        leaf_type: LeafType,
-        fixed: Mapping[int, int] | None = None,
-        moved: Mapping[int, int] | None = None,
-    ) -> Diagram:
-        """Rebuild with new leaves (by first occurrence), levels fixed to a value, levels moved."""
-        manager = self.manager
+    def with_leaves(self, images: npt.NDArray[Any], leaf_type: LeafType) -> Diagram:
+        """Rebuild with new leaves, by first occurrence."""
         self._refresh()
+        out = np.zeros(len(self.nodes), dtype=np.int32)
+        out[self.is_leaf] = self.manager.leaf_nodes(payloads(leaf_type, images))
+        return self._rebuilt(out, np.flatnonzero(~self.is_leaf), {}, {}, leaf_type)
+
+    def with_levels(self, fixed: Mapping[int, int], moved: Mapping[int, int]) -> Diagram:
+        """Rebuild with levels fixed to a value, or moved; nodes below all of them stay what they are."""
+        self._refresh()
+        last = max([*fixed, *moved], default=-1)
+        changed = np.flatnonzero((self.levels <= last) & ~self.is_leaf)
+        return self._rebuilt(self.nodes.copy(), changed, fixed, moved, self.diagram.leaf_type)
+
+    def _rebuilt(
+        self,
+        images: Int32Array,
+        changed: npt.NDArray[np.int64],
+        fixed: Mapping[int, int],
+        moved: Mapping[int, int],
+        leaf_type: LeafType,
+    ) -> Diagram:
+        manager = self.manager
         fixed_child = np.full(manager.leaf_level + 1, -1, dtype=np.int32)
         level_map = np.arange(manager.leaf_level + 1, dtype=np.int32)
-        for level, value in (fixed or {}).items():
+        for level, value in fixed.items():
             fixed_child[level] = value
-        for level, target in (moved or {}).items():
+        for level, target in moved.items():
             level_map[level] = target
-        out = np.zeros(len(self.nodes), dtype=np.int32)
-        out[self.is_leaf] = manager.leaf_nodes(payloads(leaf_type, images))
         progress = np.zeros(1, dtype=np.int64)
 
         def step() -> int:
             m = manager
             return rebuild(
-                m.pool, m.head, m.unique, m.arity, self.nodes, len(self.nodes),
-                fixed_child, level_map, out, m.words, progress,
+                m.pool, m.head, m.unique, m.arity, self.nodes, changed,
+                fixed_child, level_map, images, m.words, progress,
             )  # fmt: skip
 
         manager.run(step)
-        return manager.handle(int(out[-1]), leaf_type)
+        return manager.handle(int(images[-1]), leaf_type)
 
 
 def substitute_leaves(
@@ -292,11 +303,7 @@ def restrict(diagram: Diagram, values: Mapping[int, int]) -> Diagram:
         if not 0 <= value < manager.sizes[level]:
             raise ValueError(f"value {value} at level {level}, which has {manager.sizes[level]} values")
     manager.safe_point()
-    walk = Walk(diagram)
-    images = walk.leaf_payloads()
-    if diagram.leaf_type == FLOAT:
-        images = images.view(np.float64)
-    return walk.with_leaves(images, diagram.leaf_type, fixed=values)
+    return Walk(diagram).with_levels(values, {})
 
 
 def move(diagram: Diagram, levels: Mapping[int, int]) -> Diagram:
@@ -316,11 +323,7 @@ def move(diagram: Diagram, levels: Mapping[int, int]) -> Diagram:
         if manager.sizes[level] != manager.sizes[target]:
             raise ValueError(f"levels {level} and {target} have different numbers of values")
     manager.safe_point()
-    walk = Walk(diagram)
-    images = walk.leaf_payloads()
-    if diagram.leaf_type == FLOAT:
-        images = images.view(np.float64)
-    return walk.with_leaves(images, diagram.leaf_type, moved=levels)
+    return Walk(diagram).with_levels({}, levels)
 
 
 def support(diagram: Diagram) -> list[int]:
@@ -402,8 +405,11 @@ def weighted_sum(
 
 def cofactors(diagram: Diagram, level: int) -> list[Diagram]:
     """The restriction to each value of the variable at `level`."""
-    require_level(diagram.manager, level)
-    return [restrict(diagram, {level: v}) for v in range(diagram.manager.sizes[level])]
+    manager = diagram.manager
+    require_level(manager, level)
+    manager.safe_point()
+    walk = Walk(diagram)
+    return [walk.with_levels({level: v}, {}) for v in range(manager.sizes[level])]
 
 
 def sum_out(diagram: Diagram, level: int) -> Diagram:

@@ -49,27 +49,27 @@ def collect(pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, s
 @kernel
 def rebuild(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
-    nodes: Int32Array, count: int, fixed: Int32Array, level_map: Int32Array,
+    nodes: Int32Array, changed: Int64Array, fixed: Int32Array, level_map: Int32Array,
     images: Int32Array, words: Int32Array, progress: Int64Array,
 ) -> int:  # fmt: skip
-    """Rebuild a collected diagram: `images` holds the new leaves and receives the new nodes.
+    """Rebuild the inner nodes number `changed` of a collected diagram, children first.
 
-    Where `fixed[level]` is not -1 that child is taken; other nodes move to `level_map[level]`.
+    `images` holds what each other node becomes, and receives what these become.  Where `fixed[level]`
+    is not -1 that child is taken; other nodes move to `level_map[level]`.
     """
-    leaf_level = len(arity) - 1
-    while progress[0] < count:
-        node = int64(nodes[progress[0]])
+    while progress[0] < len(changed):
+        number = changed[progress[0]]
+        node = int64(nodes[number])
         level = pool[node]
-        if level < leaf_level:
-            if fixed[level] >= 0:
-                images[progress[0]] = images[pool[pool[node + 2 + fixed[level]] + 1]]
-            else:
-                for k in range(arity[level]):
-                    words[k] = images[pool[pool[node + 2 + k] + 1]]
-                r = find_or_add(pool, head, unique, arity, int64(level_map[level]), words, 0)
-                if r < 0:
-                    return FULL
-                images[progress[0]] = r
+        if fixed[level] >= 0:
+            images[number] = images[pool[pool[node + 2 + fixed[level]] + 1]]
+        else:
+            for k in range(arity[level]):
+                words[k] = images[pool[pool[node + 2 + k] + 1]]
+            r = find_or_add(pool, head, unique, arity, int64(level_map[level]), words, 0)
+            if r < 0:
+                return FULL
+            images[number] = r
         progress[0] += 1
     return DONE
 
