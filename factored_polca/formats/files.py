@@ -52,7 +52,8 @@ def _read_spudd(text: str, overrides: Mapping[str, str], name: str) -> Document:
 
 def _write_spudd(document: Document) -> str:
     if document.tasks is not None:
-        raise ModelError("SPUDD's format can't hold tasks: write a .toml file, or leave the tasks out (--no-tasks)")
+        hint = "write a .toml file, or leave the tasks out (--no-tasks)"
+        raise ModelError([Fault("SPUDD's format can't hold tasks", hint=hint)])
     from factored_polca.formats.spudd import write_spudd
 
     return write_spudd(document.model)
