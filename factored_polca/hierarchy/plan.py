@@ -25,6 +25,7 @@ from factored_polca.hierarchy.counts import QValueCounts, count_q_values
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
+from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.models import (
     Fault,
     LimitReached,
@@ -248,10 +249,10 @@ class _Planner:
 
     def polled(self, root: SolvedTask) -> Evaluation:
         """The value of the polled policy under the model's reward."""
-        everything = tuple(range(len(self.symbolic.actions)))
         process = root.reduction.process
-        choice = Choice("polled policy", root.defined, everything, root.policy)
-        rewards = {p: self.symbolic.actions[p].rewards for p in everything}
+        taken = policy_primitives(root.policy, root.defined, len(self.symbolic.actions))
+        choice = Choice("polled policy", root.defined, taken, root.policy)
+        rewards = {p: self.symbolic.actions[p].rewards for p in taken}
         chain = DecisionProcess(self.symbolic, (choice,), process.terminal, rewards, process.reachable)
         reduction = self.reduce("polled policy", chain, self.options.block_limit)
         solution = self.optimise("polled policy", reduction, "auto")
