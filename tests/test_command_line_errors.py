@@ -155,6 +155,8 @@ def test_check_with_json_lists_the_faults_it_finds(
         (TAXI_STATE.replace("x=0", "x=9"), ["x", "'9'", "0, 1, 2, 3, 4"]),
         (TAXI_STATE + ",x=1", ["x twice"]),
         ("x", ["FEATURE=VALUE"]),
+        ('x="0"', ["'0'"]),
+        ('"x=0', ["FEATURE=VALUE"]),
         ("", ["FEATURE=VALUE"]),
     ],
 )

@@ -190,3 +190,20 @@ def test_a_plan_whose_policy_does_not_follow_from_its_tasks_is_refused(tmp_path:
             new.writestr(name, data)
     with pytest.raises(ModelError, match="not what its tasks choose"):
         load_plan(changed)
+
+
+def test_a_state_may_have_commas_and_look_alikes_in_quotes() -> None:
+    from factored_polca.cli.source import parse_state
+
+    odd = Feature("a, b=c", ["x, y", "=", "plain"])
+    mixed = Feature("m", ["1", 1, True, "true"])
+    model = Model("m", [odd, mixed], [Action("a")])
+    for text, expected in (
+        ('"a, b=c"="x, y",m=1', {"a, b=c": "x, y", "m": 1}),
+        (' "a, b=c" = "=" , m = "1" ', {"a, b=c": "=", "m": "1"}),
+        ('m=true,"a, b=c"=plain', {"a, b=c": "plain", "m": True}),
+        ('m="true","a, b=c"="plain"', {"a, b=c": "plain", "m": "true"}),
+    ):
+        found = parse_state(text, model)
+        assert found == expected
+        assert {k: type(v) for k, v in found.items()} == {k: type(v) for k, v in expected.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -116,23 +117,33 @@ def parse_actions(text: str, model: Model) -> list[str]:
 
 
 def parse_state(text: str, model: Model) -> dict[str, Value]:
-    """`x=3,y=on` as {feature: value}.
+    """`x=3,y=on,"a feature"="a, b"` as {feature: value}.
+
+    What stands in double quotes may have commas and equal signs; a value in quotes is a name, never a
+    number or a truth value.
 
     Raises:
         ModelError: an unknown feature or value, or a feature without one.
     """
+    if text.count('"') % 2:
+        raise ModelError(f"--state takes FEATURE=VALUE,...; a quote is not closed in {text!r}")
     state: dict[str, Value] = {}
-    for part in text.split(","):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals:
+    for part in re.findall(r'(?:"[^"]*"|[^,"])+|^$', text):
+        match = re.fullmatch(r'\s*("[^"]*"|[^"=]*?)\s*=\s*("[^"]*"|[^"]*?)\s*', part)
+        if match is None:
             raise ModelError(f"--state takes FEATURE=VALUE,..., not {part!r}")
+        name, value = match[1].strip('"'), match[2]
         try:
             feature = model.feature(name)
         except KeyError as error:
             raise ModelError(str(error.args[0])) from None
         if name in state:
             raise ModelError(f"--state gives {name} twice")
-        by_text = value_texts(feature.values)
+        if value.startswith('"'):
+            value = value[1:-1]
+            by_text: Mapping[str, Value] = {v: v for v in feature.values if isinstance(v, str)}
+        else:
+            by_text = value_texts(feature.values)
         if value not in by_text:
             listed = ", ".join(list(by_text)[:20])
             raise ModelError(f"{name} has no value {value!r}; it has {listed}")
@@ -144,5 +155,6 @@ def parse_state(text: str, model: Model) -> dict[str, Value]:
 
 
 def value_texts(values: Sequence[Value]) -> Mapping[str, Value]:
-    """Values by the text a person writes for them."""
-    return {str(v).lower() if isinstance(v, bool) else str(v): v for v in values}
+    """Values by the text a person writes for them; truth values and numbers before names like them."""
+    ordered = sorted(values, key=lambda v: not isinstance(v, str))
+    return {str(v).lower() if isinstance(v, bool) else str(v): v for v in ordered}
