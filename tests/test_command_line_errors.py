@@ -187,7 +187,7 @@ def test_memory_that_runs_out_on_the_way_is_a_limit(
     fail: Fail, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     monkeypatch.setattr(commands, "current_memory_bytes", lambda: 0)
-    message = fail(3, command, "expon", "--set", "size=14", "--memory", "2MiB", "-q")
+    message = fail(3, command, "sysadmin", "--set", "size=12", "--memory", "2MiB", "-q")
     assert "limit reached" in message
     assert "memory limit of 2 MiB" in message
 

@@ -40,7 +40,7 @@ def compile_kernels(output: Output) -> float:
 
     if is_compiled():
         return warm_up()
-    with output.progress("compiling numeric kernels, once for this installation (some 10 seconds)"):
+    with output.progress("compiling numeric kernels, once for this installation (10 to 20 seconds)"):
         return warm_up()
 
 
