@@ -42,6 +42,13 @@ STATES = [
     ("taxi", {"anywhere": "true", "noise_bits": "3"}, 25 * 27 * 4 * 8),
     ("workshop", {}, 4**8 * 60),
     ("workshop", {"size": "1", "decay": "0"}, 4 * 60),
+    # Partially observable: see test_pomdp_domains.py.
+    ("cheese", {}, 11),
+    ("coffee", {}, 432),
+    ("hallway", {}, 60),
+    ("network", {}, 2**4),
+    ("rocksample", {}, 4 * 5 * 2**4),
+    ("tiger", {}, 2),
 ]
 
 
@@ -514,7 +521,7 @@ def test_describe_gives_each_parameter_with_default_type_and_meaning() -> None:
             assert parameter.documentation, (name, parameter.name)
         names = [parameter.name for parameter in description.parameters]
         assert "discount" in names
-        assert names[0] == "size" or name == "toy"
+        assert names[0] == "size" or name in ("toy", "cheese", "coffee", "tiger")
     size, slip = library.describe("taxi").parameters[:2]
     assert (size.name, size.default, size.kind) == ("size", 5, "integer")
     assert (slip.default, slip.kind) == (False, "true or false or text")

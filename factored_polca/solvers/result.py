@@ -11,7 +11,9 @@ from typing import Literal
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 
 GuaranteeKind = Literal["exact", "bounds", "heuristic", "statistical"]
-Status = Literal["converged", "rounding limit", "time limit", "iteration limit", "interrupted"]
+Status = Literal[
+    "converged", "rounding limit", "time limit", "iteration limit", "memory limit", "interrupted"
+]
 
 
 @dataclass(frozen=True)
