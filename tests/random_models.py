@@ -49,7 +49,8 @@ def random_term(domain: Domain, references: Sequence[Reference]) -> Expression:
     return reader.tree(references, lambda: Constant(first.pop() if first else domain.amount()))
 
 
-def _random_action(domain: Domain, name: str, synchronic: bool) -> Action:
+def random_action(domain: Domain, name: str, synchronic: bool) -> Action:
+    """An action that changes some features; its readers are those of the domain."""
     random = domain.random
     order = random.sample([f.name for f in domain.features], len(domain.features))
     effects: list[tuple[str, Expression]] = []
@@ -104,7 +105,8 @@ def _with_applicability(domain: Domain, actions: list[Action]) -> list[Action]:
     ]
 
 
-def _random_initial(domain: Domain) -> InitialBelief:
+def random_initial(domain: Domain) -> InitialBelief:
+    """An initial belief of one of the four forms: none, a product, a network, with factors."""
     random = domain.random
     kind = random.choice(("none", "product", "network", "factors"))
     names = random.sample([f.name for f in domain.features], len(domain.features))
@@ -154,7 +156,7 @@ def random_model(
     """
     random = Random(f"model {seed}")
     domain = random_domain(random, random.randint(*features), values, max_states, parameters)
-    made = [_random_action(domain, f"a{i}", synchronic) for i in range(random.randint(*actions))]
+    made = [random_action(domain, f"a{i}", synchronic) for i in range(random.randint(*actions))]
     if inapplicable and random.random() < 0.5:
         made = _with_applicability(domain, made)
     core = sorted(domain.core)
@@ -171,7 +173,7 @@ def random_model(
         made,
         rewards=rewards,
         terminal=ending,
-        initial=_random_initial(domain),
+        initial=random_initial(domain),
         discount=random.choice(DISCOUNTS),
         parameters=domain.parameters,
     )

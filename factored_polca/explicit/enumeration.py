@@ -39,7 +39,7 @@ Path: TypeAlias = tuple[str, ...]
 Result = TypeVar("Result")
 
 
-class _Faults:
+class Faults:
     """The first fault found at each place of the model."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class _Faults:
             raise ModelError(self.first.values())
 
 
-class _Memo(Generic[Result]):
+class Memo(Generic[Result]):
     """A function of a state that reads only the references of an expression, computed once each."""
 
     def __init__(self, expression: Expression, compute: Callable[[Assignment], Result]) -> None:
@@ -79,13 +79,13 @@ class _Memo(Generic[Result]):
         return any(primed for _, primed in self.read)
 
 
-DistributionMemo: TypeAlias = _Memo[tuple[Fraction, ...] | Undefined]
-NumberMemo: TypeAlias = _Memo[Fraction | Undefined]
+DistributionMemo: TypeAlias = Memo[tuple[Fraction, ...] | Undefined]
+NumberMemo: TypeAlias = Memo[Fraction | Undefined]
 
 
 def _distribution_memo(model: Model, expression: Expression, values: tuple[Value, ...]) -> DistributionMemo:
     parameters = dict(model.parameters)
-    return _Memo(expression, lambda x: distribution(expression, values, x, parameters))
+    return Memo(expression, lambda x: distribution(expression, values, x, parameters))
 
 
 def _number_memo(model: Model, expression: Expression) -> NumberMemo:
@@ -100,10 +100,11 @@ def _number_memo(model: Model, expression: Expression) -> NumberMemo:
         shown = describe(value) if isinstance(value, str) else "a distribution"
         return Undefined(f"a number is needed, not {shown}")
 
-    return _Memo(expression, compute)
+    return Memo(expression, compute)
 
 
-def _condition_memo(model: Model, expression: Expression) -> _Memo[bool | Undefined]:
+def condition_memo(model: Model, expression: Expression) -> Memo[bool | Undefined]:
+    """A condition of the model as a function of a state."""
     parameters = dict(model.parameters)
 
     def compute(x: Assignment) -> bool | Undefined:
@@ -112,14 +113,14 @@ def _condition_memo(model: Model, expression: Expression) -> _Memo[bool | Undefi
             return value
         return Undefined("a condition must be true or false")
 
-    return _Memo(expression, compute)
+    return Memo(expression, compute)
 
 
-class _ActionReader:
+class ActionReader:
     """The rows and expected rewards of one action."""
 
     def __init__(
-        self, model: Model, action: Action, terms: Sequence[tuple[Path, Expression]], faults: _Faults
+        self, model: Model, action: Action, terms: Sequence[tuple[Path, Expression]], faults: Faults
     ) -> None:
         self.path: Path = ("actions", action.name)
         self.features = model.features
@@ -171,6 +172,23 @@ class _ActionReader:
             row[number] = row.get(number, Fraction(0)) + chance
         return row
 
+    def observe(self, before: Assignment, after: Assignment) -> dict[tuple[int, ...], Fraction] | None:
+        """The joint distribution of the channels' value numbers after a step, or None at a fault."""
+        x = {**before, **{(name, True): value for (name, _), value in after.items()}}
+        joint: dict[tuple[int, ...], Fraction] = {(): Fraction(1)}
+        for name, (_, memo) in self.channels.items():
+            chances = memo(x)
+            if isinstance(chances, Undefined):
+                self.faults.add((*self.path, "senses", name), chances.reason, x)
+                return None
+            joint = {
+                (*seen, value): share * chance
+                for seen, share in joint.items()
+                for value, chance in enumerate(chances)
+                if chance
+            }
+        return joint
+
     def reward(self, state: Assignment, row: Row, states: Sequence[Assignment]) -> Fraction:
         """R(x, a): the terms' expected sum."""
         total = Fraction(0)
@@ -216,6 +234,29 @@ def _topological(names: Sequence[str], parents: Mapping[str, set[str]]) -> list[
     return order
 
 
+def list_states(
+    model: Model, maximum_states: int
+) -> tuple[tuple[tuple[Value, ...], ...], list[dict[tuple[str, bool], Value]]]:
+    """The states by number: as tuples of values, and as assignments.
+
+    Raises:
+        ModelError: structural faults of the model.
+        LimitReached: more than `maximum_states` states.
+    """
+    errors = [fault for fault in check(model) if fault.severity == "error"]
+    if errors:
+        raise ModelError(errors)
+    if model.states > maximum_states:
+        raise LimitReached(
+            f"{model.name}: {model.states} states are more than the {maximum_states} that may be "
+            "enumerated; raise maximum_states or use the symbolic reading",
+            stage="enumeration",
+        )
+    combinations = tuple(product(*(feature.values for feature in model.features)))
+    keys = [(feature.name, False) for feature in model.features]
+    return combinations, [dict(zip(keys, values, strict=True)) for values in combinations]
+
+
 def enumerate_model(
     model: Model,
     *,
@@ -236,25 +277,14 @@ def enumerate_model(
         LimitReached: the model has more than `maximum_states` states.
         KeyError: an unknown action; the message lists those there are.
     """
-    errors = [fault for fault in check(model) if fault.severity == "error"]
-    if errors:
-        raise ModelError(errors)
-    if model.states > maximum_states:
-        raise LimitReached(
-            f"{model.name}: {model.states} states are more than the {maximum_states} that may be "
-            "enumerated; raise maximum_states or use the symbolic reading",
-            stage="enumeration",
-        )
-    faults = _Faults()
-    combinations = tuple(product(*(feature.values for feature in model.features)))
-    keys = [(feature.name, False) for feature in model.features]
-    states = [dict(zip(keys, values, strict=True)) for values in combinations]
+    combinations, states = list_states(model, maximum_states)
+    faults = Faults()
     ending = model.terminal if terminal is None else resolve(model, as_expression(terminal))
-    ends = _conditions(_condition_memo(model, ending), states, ("terminal",), faults)
+    ends = conditions_at(condition_memo(model, ending), states, ("terminal",), faults)
     chosen = [model.action(name) for name in actions] if actions is not None else list(model.actions)
-    read = [_read_action(model, action, _terms(model, action, rewards), states, ends, faults)
+    read = [_read_action(model, action, reward_terms(model, action, rewards), states, ends, faults)
             for action in chosen]  # fmt: skip
-    initial = _initial_belief(model, states, faults)
+    initial = initial_belief(model, states, faults)
     faults.raise_if_any()
     return ExactMDP(
         features=model.features,
@@ -269,9 +299,10 @@ def enumerate_model(
     )
 
 
-def _terms(
-    model: Model, action: Action, rewards: Mapping[str, Sequence[ExpressionLike]] | None
+def reward_terms(
+    model: Model, action: Action, rewards: Mapping[str, Sequence[ExpressionLike]] | None = None
 ) -> list[tuple[Path, Expression]]:
+    """The reward terms of an action with their places: those given, or the model's and its own."""
     if rewards is not None:
         terms = [resolve(model, as_expression(term)) for term in rewards.get(action.name, ())]
     else:
@@ -279,9 +310,10 @@ def _terms(
     return [(("reward", str(index)), term) for index, term in enumerate(terms)]
 
 
-def _conditions(
-    memo: _Memo[bool | Undefined], states: Sequence[Assignment], path: Path, faults: _Faults
+def conditions_at(
+    memo: Memo[bool | Undefined], states: Sequence[Assignment], path: Path, faults: Faults
 ) -> tuple[bool, ...]:
+    """A condition at each state, False where it is a fault."""
     values: list[bool] = []
     for state in states:
         value = memo(state)
@@ -298,10 +330,10 @@ def _read_action(
     terms: Sequence[tuple[Path, Expression]],
     states: Sequence[Assignment],
     ends: Sequence[bool],
-    faults: _Faults,
+    faults: Faults,
 ) -> tuple[tuple[Row, ...], tuple[Fraction, ...], tuple[bool, ...]]:
-    reader = _ActionReader(model, action, terms, faults)
-    condition = _condition_memo(model, action.applicable)
+    reader = ActionReader(model, action, terms, faults)
+    condition = condition_memo(model, action.applicable)
     rows: list[Row] = []
     rewards: list[Fraction] = []
     applicable: list[bool] = []
@@ -317,7 +349,7 @@ def _read_action(
     return tuple(rows), tuple(rewards), tuple(applicable)
 
 
-def _initial_belief(model: Model, states: Sequence[Assignment], faults: _Faults) -> tuple[Fraction, ...]:
+def initial_belief(model: Model, states: Sequence[Assignment], faults: Faults) -> tuple[Fraction, ...]:
     """b0 at each state: the network's factors from parents to children, then the others."""
     given = dict(model.initial.distributions)
     if not model.initial.factors:

@@ -33,7 +33,7 @@ import numpy as np
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.models.errors import ModelError
-from factored_polca.solvers import tree_kernels
+from factored_polca.solvers import tree_beliefs, tree_bounds
 from factored_polca.solvers.belief_tree import (
     LOG,
     NODES,
@@ -92,8 +92,8 @@ class Search:
         self.roots = np.array([self._node(root.y, root.belief) for root in problem.roots], dtype=np.int64)
         self._take_points(above)
         for node in self.roots.tolist():
-            tree_kernels.refresh_upper(self.tree, node)
-            tree_kernels.refresh_lower(self.tree, node)
+            tree_bounds.refresh_upper(self.tree, node)
+            tree_bounds.refresh_lower(self.tree, node)
         self.generator = np.random.default_rng(self.demand.seed)
         self.widening = problem.slack + merge_widening(problem)
         self.next_tidy = int(self.tree.counts[VECTORS]) + 50
@@ -106,7 +106,7 @@ class Search:
         self.tree = grown(self.tree, self.least)
         self.tree.touched[: len(states)] = states
         self.tree.dense[states] = belief[states]
-        return tree_kernels.find_or_add(self.problem.arrays, self.tree, y, 1.0, len(states))
+        return tree_beliefs.find_or_add(self.problem.arrays, self.tree, y, 1.0, len(states))
 
     def _take_points(self, above: DelayedBound) -> None:
         """Make nodes of the points of the starting bound that say more than its corners."""
@@ -124,7 +124,7 @@ class Search:
         for point in useful.tolist():
             node = self._node(int(above.points.y[point]), above.belief(point))
             self.tree.upper[node] = min(self.tree.upper[node], values[point])
-            tree_kernels.log_point(self.tree, node)
+            tree_bounds.log_point(self.tree, node)
 
     # -- bounds --------------------------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class Search:
         buckets = len(self.tree.bucket)
         if self.tree.counts[NODES] > 2 * buckets:
             self.tree = self.tree._replace(bucket=np.full(8 * buckets, -1, dtype=np.int64))
-            tree_kernels.rehash(self.tree)
+            tree_beliefs.rehash(self.tree)
 
     def _raise_and_tidy(self) -> None:
         tree, problem = self.tree, self.problem
@@ -216,12 +216,12 @@ class Search:
             before = tree.lower.copy()
             for part in np.array_split(opened, max(1, len(opened) // 200)):
                 tree = self.tree = grown(self.tree, self.least * len(part))
-                tree_kernels.raise_lower(
+                tree_bounds.raise_lower(
                     problem.arrays, tree, part, before, problem.discount, gain, self.least
                 )
                 self.demand.poll()
         used = np.zeros(max(len(tree.upper), len(tree.vector_class)), dtype=np.int64)
-        tree_kernels.tidy(tree, used)
+        tree_bounds.tidy(tree, used)
         self.next_tidy = int(tree.counts[VECTORS] * self.style.tidy_factor) + 50
 
     def _sweep(self) -> None:
@@ -231,15 +231,15 @@ class Search:
             self.evaluated = done
         threshold = 1e-3 * self.demand.gap
         self.tree = grown(self.tree, self.least * max(1, int(self.tree.counts[NODES]) // 4))
-        tree_kernels.sweep(self.problem.arrays, self.tree, self.problem.discount, threshold, evaluate)
+        tree_bounds.sweep(self.problem.arrays, self.tree, self.problem.discount, threshold, evaluate)
 
     # -- the result ----------------------------------------------------------------------------
 
     def solution(self, status: Status) -> POMDPSolution:
         """What has been found."""
         for node in self.roots.tolist():
-            tree_kernels.refresh_lower(self.tree, node)
-            tree_kernels.refresh_upper(self.tree, node)
+            tree_bounds.refresh_lower(self.tree, node)
+            tree_bounds.refresh_upper(self.tree, node)
         self.note()
         last, policy = self.history[-1], self._policy()
         widest = float((self.root_upper - self.root_lower).max(initial=0.0))

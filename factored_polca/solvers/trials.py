@@ -19,7 +19,7 @@ from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.belief_tree import BINS, CHOICES, LINKS, LOG, NUMBERS, TRIALS, VECTORS, Tree
 from factored_polca.solvers.compiled import kernel
 from factored_polca.solvers.pomdp_problem import Arrays
-from factored_polca.solvers.tree_kernels import (
+from factored_polca.solvers.tree_bounds import (
     back_up,
     lower_of_choice,
     refresh_lower,

@@ -29,6 +29,7 @@ from factored_polca.models.expressions import (
     parts_first,
 )
 from factored_polca.models.features import Feature, position
+from factored_polca.models.model import Observation
 from factored_polca.models.scalars import Scalar, Undefined, apply_operator, describe, scalar
 
 
@@ -44,6 +45,9 @@ class Distribution:
 
 
 TableValue = Union[Scalar, Distribution, Undefined]
+
+Variable = Union[Feature, Observation]
+"""What an expression may refer to."""
 
 
 @dataclass
@@ -68,12 +72,12 @@ class ExpressionCompiler:
     def __init__(
         self,
         manager: Manager,
-        features: Sequence[Feature],
+        variables: Sequence[Variable],
         levels: Mapping[Reference, int],
         parameters: Mapping[str, Fraction],
     ) -> None:
         self.manager = manager
-        self.features = {feature.name: feature for feature in features}
+        self.variables = {variable.name: variable for variable in variables}
         self.levels = levels
         self.parameters = parameters
         self.table = ValueTable()
@@ -142,7 +146,7 @@ class ExpressionCompiler:
         return result
 
     def _reference(self, reference: Reference) -> Diagram:
-        values = self.features[reference.name].values
+        values = self.variables[reference.name].values
         level = self.levels[reference]
         if len(values) == 1:
             return self._constant(scalar(values[0]))
@@ -157,13 +161,13 @@ class ExpressionCompiler:
         return choose(strange, reasons, result)
 
     def _switch(self, e: Switch) -> Diagram:
-        feature = self.features[e.reference.name]
+        values = self.variables[e.reference.name].values
         level = self.levels[e.reference]
         missing = self._constant(Undefined(f"the switch over {e.reference.name!r} has no such case"))
         otherwise = missing if e.otherwise is None else self._memo[e.otherwise]
         cases: dict[Expression, list[int]] = {}
         for value, case in e.cases:
-            index = position(feature.values, value)
+            index = position(values, value)
             if index is not None:
                 cases.setdefault(case, []).append(index)
         result = otherwise
@@ -213,16 +217,16 @@ def _distribution(values: Sequence[Any]) -> TableValue:
     return Distribution(outcomes, tuple(kind for kind, _ in chances))
 
 
-def row_of(feature: Feature, value: TableValue) -> tuple[Fraction, ...] | Undefined:
-    """The probability of each value of `feature` that a table value stands for."""
+def row_of(variable: Variable, value: TableValue) -> tuple[Fraction, ...] | Undefined:
+    """The probability of each value of `variable` that a table value stands for."""
     if isinstance(value, Undefined):
         return value
     outcomes = value.outcomes if isinstance(value, Distribution) else ((value, Fraction(1)),)
-    row = [Fraction(0)] * len(feature.values)
+    row = [Fraction(0)] * len(variable.values)
     for outcome, chance in outcomes:
-        index = position(feature.values, outcome)
+        index = position(variable.values, outcome)
         if index is None:
-            return Undefined(f"{describe(outcome)} is no value of {feature.name!r}")
+            return Undefined(f"{describe(outcome)} is no value of {variable.name!r}")
         row[index] += chance
     return tuple(row)
 

@@ -39,7 +39,7 @@ def compile_initial(build: _Build) -> dict[int, RowDiagram]:
     for name, expression in model.initial.distributions:
         moved = primed(expression)
         rows[numbers[name]] = build.rows(
-            numbers[name], build.compiler.compile(moved), moved, ("initial", name), build.true
+            numbers[name], model.feature(name), moved, ("initial", name), build.true
         )
     build.settle_suspects(rows)
     if model.initial.factors:

@@ -2,10 +2,11 @@
 
 The variables are interleaved: the feature at position i of the order has level 2i now and level
 2i + 1 next.  For each action a and each feature it changes, a *row diagram* maps the parents to the
-number of a row of exact probabilities; features an action does not change have none.  Reward terms
-are diagrams over x of exact rationals, expectations over x' taken:
+number of a row of exact probabilities; features an action does not change have none.  Observations
+have row diagrams over (x, x') likewise, and the levels below all features (`observations`).  Reward
+terms are diagrams over x of exact rationals, expectations over o and x' taken:
 
-    R_a(x) = sum over terms r of E[r(x, x') | x, a].
+    R_a(x) = sum over terms r of E[r(x, x', o) | x, a].
 
 Where a is not applicable (app_a = applicable and not terminal) rows and rewards mean nothing, so
 faults count only where app_a holds, and there only in contexts of positive probability; elsewhere
@@ -27,7 +28,6 @@ from factored_polca.diagrams import (
     Manager,
     choose,
     cofactors,
-    combine,
     leaves,
     relabel,
     restrict,
@@ -37,10 +37,15 @@ from factored_polca.diagrams import (
 from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, check
 from factored_polca.models.expressions import ZERO, Expression, Reference, references
 from factored_polca.models.scalars import Undefined, describe
-from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, row_of, used
+from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, Variable, row_of, used
 from factored_polca.symbolic.initial import compile_initial
+from factored_polca.symbolic.observations import (
+    compile_observations,
+    expect_observations,
+    restrict_to_possible,
+)
 from factored_polca.symbolic.order import variable_order
-from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, numbered, possible
+from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, mean, numbered, possible
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,8 @@ class SymbolicAction:
 
     `rows` maps changed features to their row diagrams; `elimination` lists all features, children of
     synchronic arcs before their parents; `app` is where the action is applicable and x not terminal.
-    `rewards` are expectations over x'; `sampled_rewards` the same terms as functions of (x, x').
+    `rewards` are expectations over x' and o; `sampled_rewards` the same terms as functions of (x, x').
+    `observations` maps the channels that the action senses to their row diagrams over (x, x').
     """
 
     name: str
@@ -58,6 +64,7 @@ class SymbolicAction:
     app: Diagram
     rewards: tuple[Term, ...]
     sampled_rewards: tuple[Term, ...]
+    observations: dict[int, RowDiagram] = field(default_factory=dict)
 
     @property
     def synchronic(self) -> bool:
@@ -99,10 +106,11 @@ class SymbolicModel:
     def columns(self) -> list[int]:
         """For each level the column of its feature in an array of states [row, feature].
 
-        Next variables use columns n, n + 1, ... (an array of pairs of states is [row, 2n]).
+        Next variables use columns n, n + 1, ... (an array of pairs of states is [row, 2n]), and
+        observations, which no finished diagram tests, those from 2n on.
         """
         count = len(self.model.features)
-        result = [0] * (2 * count)
+        result = list(range(2 * count + len(self.model.observations)))
         for i in range(count):
             result[self.now(i)] = i
             result[self.next(i)] = count + i
@@ -155,6 +163,7 @@ def compile_model(
     for place, name in enumerate(names):
         position[features[name]] = place
     sizes = [size for name in names for size in [len(model.feature(name).values)] * 2]
+    sizes += [len(channel.values) for channel in model.observations]
     manager = Manager(sizes, memory_limit=memory_limit)
     manager.deadline = deadline
     levels = {
@@ -162,7 +171,9 @@ def compile_model(
         for name, index in features.items()
         for primed in (False, True)
     }
-    compiler = ExpressionCompiler(manager, model.features, levels, dict(model.parameters))
+    levels |= {Reference(o.name): 2 * len(names) + i for i, o in enumerate(model.observations)}
+    variables: list[Variable] = [*model.features, *model.observations]
+    compiler = ExpressionCompiler(manager, variables, levels, dict(model.parameters))
     return _Build(model, names, tuple(position), manager, compiler).finish()
 
 
@@ -191,10 +202,10 @@ def compile_term(
     """
     build = _Build.again(symbolic)
     compiled = symbolic.actions[action]
-    result = build.term(expression, path, compiled.rows, compiled.elimination, where)
+    term = build.sampled_term(expression, path, where, compiled.rows, compiled.observations)
     if build.faults:
         raise ModelError(build.faults)
-    return result
+    return build.expected(term, compiled.rows, compiled.elimination)
 
 
 class _Build:
@@ -211,7 +222,7 @@ class _Build:
         self.model, self.order, self.positions = model, order, positions
         self.manager, self.compiler = manager, compiler
         self.faults: list[Fault] = []
-        self.suspects: list[tuple[Feature, Diagram, Diagram, tuple[str, ...]]] = []
+        self.suspects: list[tuple[Variable, Diagram, Diagram, tuple[str, ...]]] = []
         self.false, self.true = manager.constant(0), manager.constant(1)
 
     @classmethod
@@ -255,6 +266,9 @@ class _Build:
         self.faults.append(Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}"))
 
     def level_text(self, level: int, value: int) -> str:
+        if level >= 2 * len(self.order):
+            channel = self.model.observations[level - 2 * len(self.order)]
+            return f"{channel.name}={_show(channel.values[value])}"
         feature = self.model.feature(self.order[level // 2])
         return f"{feature.name}{chr(39) if level % 2 else ''}={_show(feature.values[value])}"
 
@@ -270,30 +284,35 @@ class _Build:
         for name, effect in action.effects:
             if effect == Reference(name):
                 continue
-            rows[numbers[name]] = self.rows(
-                numbers[name], self.compiler.compile(effect), effect, (*path, "effects", name), app
+            number = numbers[name]
+            rows[number] = self.rows(
+                number, self.model.features[number], effect, (*path, "effects", name), app
             )
         self.settle_suspects(rows)
+        observations = compile_observations(self, action, app, rows)
         elimination = self.elimination(rows)
         terms: list[tuple[Expression, tuple[str, ...]]]
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
         terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
         terms = [(expression, where) for expression, where in terms if expression != ZERO]
-        sampled = tuple(self.sampled_term(expression, where, app, rows) for expression, where in terms)
+        sampled = tuple(self.sampled_term(e, where, app, rows, observations) for e, where in terms)
         rewards = tuple(self.expected(term, rows, elimination) for term in sampled)
-        return SymbolicAction(action.name, rows, elimination, app, rewards, sampled)
+        return SymbolicAction(action.name, rows, elimination, app, rewards, sampled, observations)
 
     def rows(
-        self, index: int, compiled: Diagram, effect: Expression, path: tuple[str, ...], where: Diagram
+        self, index: int, variable: Variable, given: Expression, path: tuple[str, ...], where: Diagram
     ) -> RowDiagram:
-        """The row diagram of an effect; where it is none it becomes a suspect: see `settle_suspects`."""
-        feature = self.model.features[index]
-        fallback = tuple(Fraction(int(v == 0)) for v in range(len(feature.values)))
+        """The row diagram of an effect, or of what is sensed, for the variable numbered `index`.
+
+        Where it is none it becomes a suspect: see `settle_suspects`.
+        """
+        compiled = self.compiler.compile(given)
+        fallback = tuple(Fraction(int(v == 0)) for v in range(len(variable.values)))
         numbers: dict[Row, int] = {}
         images = np.zeros(len(self.compiler.table.values), dtype=np.uint64)
         bad = np.zeros(len(images), dtype=np.uint64)
         for entry in sorted(used(compiled)):
-            row = row_of(feature, self.compiler.value(entry))
+            row = row_of(variable, self.compiler.value(entry))
             if isinstance(row, Undefined):
                 bad[entry] = 1
                 row = fallback
@@ -301,17 +320,17 @@ class _Build:
         if bad.any():
             wrong = relabel(compiled, bad, INDEX) & where
             if wrong != self.false:
-                self.suspects.append((feature, compiled, wrong, path))
-        primed = {r.name for r in references(effect) if r.primed}
+                self.suspects.append((variable, compiled, wrong, path))
+        primed = {r.name for r in references(given) if r.primed}
         parents = tuple(i for i, f in enumerate(self.model.features) if f.name in primed)
         return RowDiagram(index, relabel(compiled, images, INDEX), tuple(numbers), parents)
 
     def settle_suspects(self, rows: dict[int, RowDiagram]) -> None:
         """Report the rows that are wrong where next values of positive probability lead."""
-        for feature, compiled, wrong, path in self.suspects:
+        for variable, compiled, wrong, path in self.suspects:
             happens = self.happening(wrong, rows)
             if happens != self.false:
-                self.report_row(feature, compiled, happens, path)
+                self.report_row(variable, compiled, happens, path)
         self.suspects.clear()
 
     def happening(self, condition: Diagram, rows: dict[int, RowDiagram]) -> Diagram:
@@ -336,20 +355,21 @@ class _Build:
         return condition
 
     def report_row(
-        self, feature: Feature, compiled: Diagram, wrong: Diagram, path: tuple[str, ...]
+        self, variable: Variable, compiled: Diagram, wrong: Diagram, path: tuple[str, ...]
     ) -> None:
-        """Record the first context where a row is no distribution over the feature's values."""
+        """Record the first context where a row is no distribution over the variable's values."""
         state = states_for_leaves(wrong)[leaves(wrong).index(1)]
         number = restrict(compiled, {level: int(v) for level, v in enumerate(state)}).value
-        row = row_of(feature, self.compiler.value(int(number)))
+        row = row_of(variable, self.compiler.value(int(number)))
         assert isinstance(row, Undefined)
         tested = sorted(set(support(compiled)))
         context = ", ".join(self.level_text(level, int(state[level])) for level in tested)
         where = f" at {context}" if context else ""
-        hint = f"values of {feature.name!r} are {', '.join(_show(v) for v in feature.values[:12])}"
+        hint = f"values of {variable.name!r} are {', '.join(_show(v) for v in variable.values[:12])}"
         if "sum to" in row.reason:
             hint = "make the row sum to exactly 1; 0.333 is not 1/3"
-        self.faults.append(Fault(f"the distribution of {feature.name}'{where}: {row.reason}", path, hint))
+        name = f"{variable.name}'" if isinstance(variable, Feature) else variable.name
+        self.faults.append(Fault(f"the distribution of {name}{where}: {row.reason}", path, hint))
 
     def elimination(self, rows: dict[int, RowDiagram]) -> tuple[int, ...]:
         """All features, those nobody's next value depends on first."""
@@ -360,29 +380,25 @@ class _Build:
         key = self.positions.__getitem__
         return tuple(nx.lexicographical_topological_sort(graph, key=lambda i: -key(i)))
 
-    def term(
+    def sampled_term(
         self,
         expression: Expression,
         path: tuple[str, ...],
-        rows: dict[int, RowDiagram],
-        elimination: tuple[int, ...],
         where: Diagram,
+        rows: dict[int, RowDiagram],
+        observations: dict[int, RowDiagram],
     ) -> Term:
-        """A reward term with its expectation over x' taken."""
-        return self.expected(self.sampled_term(expression, path, where, rows), rows, elimination)
-
-    def sampled_term(
-        self, expression: Expression, path: tuple[str, ...], where: Diagram, rows: dict[int, RowDiagram]
-    ) -> Term:
-        """A reward term as a function of (x, x'); a condition counts as 0 or 1."""
+        """A reward term as a function of (x, x'), o in expectation; a condition counts as 0 or 1."""
         compiled = self.compiler.compile(expression)
         bad = np.array(
             [not isinstance(v, (Fraction, bool)) for v in self.compiler.table.values], dtype=np.uint64
         )
-        wrong = self.happening(relabel(compiled, bad, INDEX) & where, rows)
+        wrong = restrict_to_possible(self, relabel(compiled, bad, INDEX) & where, observations)
+        wrong = self.happening(wrong, rows)
         if wrong != self.false:
             self.report(compiled, wrong, path, "the reward", "a number")
-        return numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+        term = numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+        return expect_observations(self, term, observations)
 
     def expected(self, term: Term, rows: dict[int, RowDiagram], elimination: tuple[int, ...]) -> Term:
         """The expectation over x' of a term."""
@@ -394,16 +410,10 @@ class _Build:
 
     def expectation(self, term: Term, index: int, level: int, row: RowDiagram | None) -> Term:
         """The term with the next value of one feature summed out."""
+        if row is not None:
+            return mean(term, level, row)
         parts = cofactors(term.diagram, level)
-        if row is None:
-            result = parts[-1]
-            for value in range(len(parts) - 1):
-                result = choose(self.manager.indicator(level - 1, [value]), parts[value], result)
-            return Term(result, term.values)
-
-        def mean(number: int, *entries: int) -> Fraction:
-            pairs = zip(row.rows[number], entries, strict=True)
-            return sum((q * term.values[e] for q, e in pairs if q), Fraction(0))
-
-        diagram, values = combine([row.diagram, *parts], mean)
-        return Term(diagram, tuple(values))
+        result = parts[-1]
+        for value in range(len(parts) - 1):
+            result = choose(self.manager.indicator(level - 1, [value]), parts[value], result)
+        return Term(result, term.values)

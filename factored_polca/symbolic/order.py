@@ -2,7 +2,7 @@
 
 The size of diagrams depends on the order.  Heuristics work on the two-slice graph: an edge joins two
 features where one is a parent of the other under some action, or where both occur in one reward
-term or condition.
+term, one channel's distribution or one condition.
 
     file    the order of the model
     force   barycentres: each feature moves to the mean position of the terms it occurs in, repeated
@@ -45,6 +45,8 @@ def groups(model: Model, tasks: TaskHierarchy | None = None) -> list[Group]:
         for name, effect in action.effects:
             add(effect, name)
         add(action.applicable)
+        for _, sensed in action.senses:
+            add(sensed)
         for term in action.rewards:
             add(term)
     for term in model.rewards:

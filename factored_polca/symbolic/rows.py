@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from factored_polca.diagrams import INDEX, Diagram, choose, leaves, relabel
+from factored_polca.diagrams import INDEX, Diagram, choose, cofactors, combine, leaves, relabel
 
 Row = tuple[Fraction, ...]
 """The probability of each value of a feature."""
@@ -17,7 +17,11 @@ Row = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class RowDiagram:
-    """P(x_i' | parents): `diagram` maps parents to the number of a row, `rows[number]` is the row."""
+    """P(x_i' | parents): `diagram` maps parents to the number of a row, `rows[number]` is the row.
+
+    `feature` is the number of the feature, or of the channel where the row is of an observation;
+    `parents_next` are the features whose next values are read.
+    """
 
     feature: int
     diagram: Diagram
@@ -27,7 +31,7 @@ class RowDiagram:
 
 @dataclass(frozen=True)
 class Term:
-    """A function of x with exact values: `diagram` maps x to the number of an entry of `values`."""
+    """A function of x (and x') with exact values: `diagram` maps it to the number of one of `values`."""
 
     diagram: Diagram
     values: tuple[Fraction, ...]
@@ -59,3 +63,14 @@ def possible(row: RowDiagram, level: int) -> Diagram:
         here = relabel(row.diagram, positive, INDEX)
         result = choose(manager.indicator(level, [value]), here, result)
     return result
+
+
+def mean(term: Term, level: int, row: RowDiagram) -> Term:
+    """The expectation of a term over the variable at `level`, which is distributed as `row` says."""
+
+    def weigh(number: int, *entries: int) -> Fraction:
+        pairs = zip(row.rows[number], entries, strict=True)
+        return sum((q * term.values[e] for q, e in pairs if q), Fraction(0))
+
+    diagram, values = combine([row.diagram, *cofactors(term.diagram, level)], weigh)
+    return Term(diagram, tuple(values))

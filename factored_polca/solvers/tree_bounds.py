@@ -1,0 +1,325 @@
+"""The bounds of the search in compiled code: sawtooth points, backups of both bounds, sweeps.
+
+Upper bounds: the sawtooth of the corners and the logged points p (Hauskrecht 2000),
+
+    u(b) <= c . b + min over p of min over s in supp(b_p) of b(s) / b_p(s) * (u(p) - c . b_p),
+
+and u(b) <= max over j of (b . r_j + gamma * sum over k P(k) u(b_k)).  Only the best option's children
+are brought up to date, until the best option stays the best: bounds that are out of date are still
+bounds.  Lower bounds: vectors, backed up at the node (Smallwood & Sondik 1973),
+
+    alpha = r_j + gamma * sum over k of M_k alpha_k,   alpha_k the best vector at the child b_k.
+
+An option whose upper bound lies below the node's lower bound is never looked at again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factored_polca.explicit.arrays import FloatArray, IntArray
+from factored_polca.solvers.belief_tree import (
+    BACKUPS,
+    CHILDREN,
+    ENTRIES,
+    LINKS,
+    LOG,
+    NODES,
+    NUMBERS,
+    VECTORS,
+    Tree,
+)
+from factored_polca.solvers.compiled import kernel
+from factored_polca.solvers.pomdp_problem import Arrays
+from factored_polca.solvers.tree_beliefs import expand, open_node
+
+
+@kernel
+def refresh_lower(t: Tree, n: int) -> None:
+    """Look at the vectors that are newer than the last one this node has seen."""
+    y = t.node_class[n]
+    newest = t.newest_vector[y]
+    m = newest
+    start, end = t.entry_start[n], t.entry_start[n] + t.entry_count[n]
+    while m > t.vector_mark[n]:
+        at = t.vector_start[m]
+        worth = 0.0
+        for e in range(start, end):
+            worth += t.entry_weight[e] * t.number[at + t.entry_state[e]]
+        if worth > t.lower[n] or t.best_vector[n] < 0:
+            t.lower[n] = worth
+            t.best_vector[n] = m
+        m = t.vector_previous[m]
+    t.vector_mark[n] = newest
+
+
+@kernel
+def refresh_upper(t: Tree, n: int) -> None:
+    """Look at the points that were logged since this node looked last."""
+    y = t.node_class[n]
+    newest = t.newest_log[y]
+    g = newest
+    if g <= t.log_mark[n]:
+        return
+    start, end = t.entry_start[n], t.entry_start[n] + t.entry_count[n]
+    for e in range(start, end):
+        t.dense[t.entry_state[e]] = t.entry_weight[e]
+    best = t.upper[n] - t.base[n]
+    while g > t.log_mark[n]:
+        p = t.log_node[g]
+        drop = t.upper[p] - t.base[p]
+        if drop < best and t.entry_count[p] <= t.entry_count[n]:
+            ratio = 1.0
+            for e in range(t.entry_start[p], t.entry_start[p] + t.entry_count[p]):
+                share = t.dense[t.entry_state[e]]
+                if share < ratio * t.entry_weight[e]:
+                    ratio = share / t.entry_weight[e]
+                    if ratio * drop >= best:
+                        break
+            best = min(best, ratio * drop)
+        g = t.log_previous[g]
+    t.log_mark[n] = newest
+    t.upper[n] = min(t.upper[n], t.base[n] + best)
+    for e in range(start, end):
+        t.dense[t.entry_state[e]] = 0.0
+
+
+@kernel
+def best_choice(a: Arrays, t: Tree, n: int) -> int:
+    """The option with the largest upper bound, the first of equals."""
+    y = t.node_class[n]
+    best = a.first_option[y]
+    for j in range(a.first_option[y] + 1, a.first_option[y + 1]):
+        shift = j - a.first_option[y]
+        if (
+            t.choice_upper[t.first_choice[n] + shift]
+            > t.choice_upper[t.first_choice[n] + best - a.first_option[y]]
+        ):
+            best = j
+    return int(best)
+
+
+@kernel
+def log_point(t: Tree, n: int) -> None:
+    """Note that the upper bound of a node has fallen."""
+    y = t.node_class[n]
+    g = t.counts[LOG]
+    t.counts[LOG] += 1
+    t.log_node[g] = n
+    t.log_previous[g] = t.newest_log[y]
+    t.newest_log[y] = g
+
+
+@kernel
+def choice_value(a: Arrays, t: Tree, j: int, c: int, discount: float, refresh: bool) -> float:
+    """Bring the upper bound of an expanded choice up to date."""
+    total = 0.0
+    h = t.first_child[c]
+    for _ in range(a.first_branch[j], a.first_branch[j + 1]):
+        if t.child[h] >= 0:
+            if refresh:
+                refresh_upper(t, t.child[h])
+            total += t.chance[h] * t.upper[t.child[h]]
+        h += 1
+    value = min(t.choice_upper[c], t.choice_reward[c] + discount * total)
+    t.choice_upper[c] = value
+    return float(value)
+
+
+@kernel
+def settle(a: Arrays, t: Tree, n: int, discount: float, threshold: float, least: IntArray) -> int:
+    """Lower the upper bound of a node as far as its best option allows; that option, -1: no room."""
+    if t.first_choice[n] < 0:
+        open_node(a, t, n)
+    low = a.first_option[t.node_class[n]]
+    while True:
+        j = best_choice(a, t, n)
+        c = t.first_choice[n] + j - low
+        if t.first_child[c] < 0:
+            if (
+                t.counts[NODES] + least[NODES] > len(t.upper)
+                or t.counts[ENTRIES] + least[ENTRIES] > len(t.entry_state)
+                or t.counts[CHILDREN] + least[CHILDREN] > len(t.child)
+            ):
+                return -1
+            expand(a, t, n, j, c)
+        choice_value(a, t, j, c, discount, True)
+        if best_choice(a, t, n) == j:
+            break
+    value = t.choice_upper[c]
+    if value < t.upper[n]:
+        before = t.upper[n]
+        t.upper[n] = value
+        if before - value > threshold:
+            log_point(t, n)
+    return j
+
+
+@kernel
+def lower_of_choice(a: Arrays, t: Tree, j: int, c: int, discount: float) -> float:
+    """The lower bound of an expanded choice, its children brought up to date."""
+    total = 0.0
+    h = t.first_child[c]
+    for _ in range(a.first_branch[j], a.first_branch[j + 1]):
+        if t.child[h] >= 0:
+            refresh_lower(t, t.child[h])
+            total += t.chance[h] * t.lower[t.child[h]]
+        h += 1
+    return float(t.choice_reward[c] + discount * total)
+
+
+@kernel
+def back_up(a: Arrays, t: Tree, n: int, discount: float, least_gain: float) -> None:
+    """Add the vector of the best expanded option where it is worth more than what is known."""
+    y = t.node_class[n]
+    refresh_lower(t, n)
+    low = a.first_option[y]
+    best, option = t.lower[n] + least_gain, -1
+    for j in range(low, a.first_option[y + 1]):
+        c = t.first_choice[n] + j - low
+        if t.first_child[c] >= 0 and t.choice_upper[c] > best:
+            worth = lower_of_choice(a, t, j, c, discount)
+            if worth > best:
+                best, option = worth, j
+    t.counts[BACKUPS] += 1
+    if option >= 0:
+        add_vector(a, t, n, option, t.first_choice[n] + option - low, discount)
+
+
+@kernel
+def add_vector(a: Arrays, t: Tree, n: int, j: int, c: int, discount: float) -> None:
+    """Append r_j + gamma * sum_k M_k alpha_k, the alpha_k from the children of choice c of node n."""
+    y = t.node_class[n]
+    size = a.offset[y + 1] - a.offset[y]
+    m, start, link = t.counts[VECTORS], t.counts[NUMBERS], t.counts[LINKS]
+    t.counts[VECTORS] += 1
+    t.counts[NUMBERS] += size
+    t.counts[LINKS] += a.first_branch[j + 1] - a.first_branch[j]
+    for s in range(size):
+        t.other[s] = 0.0
+    h = t.first_child[c]
+    for k in range(a.first_branch[j], a.first_branch[j + 1]):
+        follower = t.best_vector[t.child[h]] if t.child[h] >= 0 else t.oldest_vector[a.branch_target[k]]
+        t.links[link] = follower
+        at = t.vector_start[follower]
+        rows = a.branch_rows[k]
+        for s in range(size):
+            total = 0.0
+            for q in range(a.row_start[rows + s], a.row_start[rows + s + 1]):
+                total += a.probability[q] * t.number[at + a.column[q]]
+            t.other[s] += total
+        link += 1
+        h += 1
+    rewards = a.reward_start[j]
+    for s in range(size):
+        t.number[start + s] = a.rewards[rewards + s] + discount * t.other[s]
+    t.vector_class[m] = y
+    t.vector_option[m] = j
+    t.vector_start[m] = start
+    t.vector_links[m] = link - (a.first_branch[j + 1] - a.first_branch[j])
+    t.vector_previous[m] = t.newest_vector[y]
+    t.newest_vector[y] = m
+    refresh_lower(t, n)
+
+
+@kernel
+def sweep(a: Arrays, t: Tree, discount: float, threshold: float, refresh: bool) -> float:
+    """Update the upper bounds of all opened nodes, the youngest first; the largest fall."""
+    largest = 0.0
+    for n in range(t.counts[NODES] - 1, -1, -1):
+        if t.first_choice[n] < 0:
+            continue
+        y = t.node_class[n]
+        best = -np.inf
+        for j in range(a.first_option[y], a.first_option[y + 1]):
+            c = t.first_choice[n] + j - a.first_option[y]
+            if t.first_child[c] >= 0 and t.choice_upper[c] > t.lower[n]:
+                choice_value(a, t, j, c, discount, refresh)
+            best = max(best, t.choice_upper[c])
+        fall = t.upper[n] - best
+        if fall > 0.0:
+            t.upper[n] = best
+            largest = max(largest, fall)
+            if fall > threshold and t.counts[LOG] < len(t.log_node):
+                log_point(t, n)
+    return largest
+
+
+@kernel
+def lower_corners(a: Arrays, t: Tree, nodes: IntArray) -> None:
+    """Take over the upper bounds of the nodes that are single states, [i] (-1: none) as corners."""
+    changed = False
+    for i in range(len(nodes)):
+        n = nodes[i]
+        if n >= 0 and t.upper[n] < t.corner[i]:
+            t.corner[i] = t.upper[n]
+            changed = True
+    if not changed:
+        return
+    for n in range(t.counts[NODES]):
+        base = 0.0
+        offset = a.offset[t.node_class[n]]
+        for e in range(t.entry_start[n], t.entry_start[n] + t.entry_count[n]):
+            base += t.entry_weight[e] * t.corner[offset + t.entry_state[e]]
+        t.base[n] = base
+        t.upper[n] = min(t.upper[n], base)
+
+
+@kernel
+def tidy(t: Tree, used: IntArray) -> None:
+    """Take out of the lists the vectors that are best at no opened node, and repeated log entries.
+
+    What is taken out stays stored: bounds and vectors made from it stay as they are.  `used` is scratch,
+    at least as long as the nodes and the vectors, zero before and after.
+    """
+    vectors, nodes = t.counts[VECTORS], t.counts[NODES]
+    for n in range(nodes):
+        if t.first_choice[n] >= 0:
+            refresh_lower(t, n)
+            used[t.best_vector[n]] = 1
+    for y in range(len(t.newest_vector)):
+        later, m = -1, t.newest_vector[y]
+        while m >= 0:
+            earlier = t.vector_previous[m]
+            if used[m] == 1 or t.vector_links[m] < 0 or later < 0:
+                later = m
+            else:
+                t.vector_previous[later] = earlier
+            m = earlier
+    used[:vectors] = 0
+    for y in range(len(t.newest_log)):
+        later, g = -1, t.newest_log[y]
+        while g >= 0:
+            earlier = t.log_previous[g]
+            if used[t.log_node[g]] == 0:
+                used[t.log_node[g]] = 1
+                later = g
+            else:
+                t.log_previous[later] = earlier
+            g = earlier
+    used[:nodes] = 0
+
+
+@kernel
+def raise_lower(
+    a: Arrays, t: Tree, order: IntArray, before: FloatArray, discount: float, gain: float, least: IntArray
+) -> int:
+    """Perseus' randomised backups (Spaan & Vlassis 2005) over the opened nodes in `order`.
+
+    A node whose bound has risen since `before` [n] was taken, by vectors backed up at others, is passed
+    over.  The number of backups.
+    """
+    backups = 0
+    for n in order:
+        refresh_lower(t, n)
+        if t.lower[n] > before[n] + gain:
+            continue
+        if (
+            t.counts[VECTORS] + least[VECTORS] > len(t.vector_class)
+            or t.counts[NUMBERS] + least[NUMBERS] > len(t.number)
+            or t.counts[LINKS] + least[LINKS] > len(t.links)
+        ):
+            break
+        back_up(a, t, n, discount, gain)
+        backups += 1
+    return backups
