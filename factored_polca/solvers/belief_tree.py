@@ -28,69 +28,66 @@ NODES, ENTRIES, CHOICES, CHILDREN, VECTORS, NUMBERS, LINKS, LOG, BACKUPS, TRIALS
 """What `Tree.counts` counts."""
 
 
+CLASS, START, COUNT, BEST, VECTOR_MARK, LOG_MARK, FIRST_CHOICE, SAME_HASH = range(8)
+"""Columns of `Tree.node`: its class, its entries, its best vector, the newest vector and log entry it has
+looked at, its first choice (-1: not opened), the next node in the same bucket."""
+
+UPPER, LOWER, BASE = range(3)
+"""Columns of `Tree.bound`; BASE is what the corners alone give."""
+
+REWARD, CHOICE_UPPER = range(2)
+"""Columns of `Tree.choice`."""
+
+OF_CLASS, OPTION, AT, OLDER, FIRST_LINK = range(5)
+"""Columns of `Tree.vector`: class, option, start in `number`, the next older vector of the class, start in
+`links` (-1: a policy by itself)."""
+
+LOGGED, LOGGED_BEFORE = range(2)
+"""Columns of `Tree.log`: a node, and the next older entry of its class."""
+
+NEWEST_VECTOR, OLDEST_VECTOR, NEWEST_LOG = range(3)
+"""Columns of `Tree.head`, by class."""
+
+
 class Tree(NamedTuple):
-    """See the module's docstring; -1 stands for "none" in all integers."""
+    """See the module's docstring; -1 stands for "none" in all integers.
+
+    Few arrays with columns, as each array is an argument of every kernel and takes time to compile.
+    """
 
     counts: IntArray  # [10]
-    # nodes [n]
-    node_class: IntArray
-    entry_start: IntArray
-    entry_count: IntArray
-    upper: FloatArray
-    lower: FloatArray
-    base: FloatArray  # what the corners alone give
-    best_vector: IntArray
-    vector_mark: IntArray  # the newest vector looked at
-    log_mark: IntArray  # the newest log entry looked at
-    first_choice: IntArray  # -1: not opened
-    same_hash: IntArray  # the next node in the same bucket
-    # entries of beliefs [e]
-    entry_state: IntArray  # within the class
-    entry_weight: FloatArray
-    # choices [c] of opened nodes, by option
-    choice_reward: FloatArray
-    choice_upper: FloatArray
-    first_child: IntArray  # -1: not expanded
-    # children [h], by branch
-    child: IntArray  # -1: probability 0
-    chance: FloatArray
-    # vectors [m]
-    vector_class: IntArray
-    vector_option: IntArray
-    vector_start: IntArray
-    vector_previous: IntArray  # the next older vector of the class
-    vector_links: IntArray  # start in `links`, -1: a policy by itself
+    node: IntArray  # [n, column]
+    bound: FloatArray  # [n, column]
+    entry_state: IntArray  # [e] entries of beliefs, states within the class
+    entry_weight: FloatArray  # [e]
+    choice: FloatArray  # [c, column], of opened nodes, by option
+    first_child: IntArray  # [c] -1: not expanded
+    child: IntArray  # [h] by branch, -1: probability 0
+    chance: FloatArray  # [h]
+    vector: IntArray  # [m, column]
     number: FloatArray  # the vectors' entries
     links: IntArray  # [l] for each branch of the vector's option, the vector it continues with
-    # log [g]
-    log_node: IntArray
-    log_previous: IntArray
-    # by class
-    newest_vector: IntArray
-    newest_log: IntArray
-    oldest_vector: IntArray
-    # others
+    log: IntArray  # [g, column]
+    head: IntArray  # [y, column]
     corner: FloatArray  # [i] upper bounds at single states
     option_bound: FloatArray  # laid out like Arrays.rewards: b . w_j bounds Q(b, j) from above
     bucket: IntArray  # heads of the hash table, a power of two
-    dense: FloatArray  # [widest class] scratch
+    dense: FloatArray  # [widest class] scratch, 0 outside kernels
     other: FloatArray  # [widest class] scratch
     touched: IntArray  # [widest class] scratch
     path: IntArray  # [depth] scratch
-    span: FloatArray  # [2] the least and largest corner at the start
-    bins: FloatArray  # [class of upper bound, class of entropy, (mean, count)] of SARSOP's prediction
+    bins: FloatArray  # [by upper bound, by entropy, (mean, count)]; the last row: least and largest corner
 
 
 GROWING: Final = {
-    "node_class": NODES, "entry_start": NODES, "entry_count": NODES, "upper": NODES, "lower": NODES,
-    "base": NODES, "best_vector": NODES, "vector_mark": NODES, "log_mark": NODES, "first_choice": NODES,
-    "same_hash": NODES, "entry_state": ENTRIES, "entry_weight": ENTRIES, "choice_reward": CHOICES,
-    "choice_upper": CHOICES, "first_child": CHOICES, "child": CHILDREN, "chance": CHILDREN,
-    "vector_class": VECTORS, "vector_option": VECTORS, "vector_start": VECTORS,
-    "vector_previous": VECTORS, "vector_links": VECTORS, "number": NUMBERS, "links": LINKS,
-    "log_node": LOG, "log_previous": LOG,
+    "node": NODES, "bound": NODES, "entry_state": ENTRIES, "entry_weight": ENTRIES, "choice": CHOICES,
+    "first_child": CHOICES, "child": CHILDREN, "chance": CHILDREN, "vector": VECTORS,
+    "number": NUMBERS, "links": LINKS, "log": LOG,
 }  # fmt: skip
 """The arrays that grow, and the count that says how full they are."""
+
+FLOATS: Final = {"bound", "entry_weight", "choice", "chance", "number"}
+COLUMNS: Final = {"node": 8, "bound": 3, "choice": 2, "vector": 5, "log": 2}
 
 
 def merge_widening(problem: Problem) -> float:
@@ -122,15 +119,14 @@ def new_tree(
     sizes = [1024, 1 << 15, 4096, 1 << 14, total + 1024, numbers + (1 << 15), 1 << 14, 4096, 0, 0]
     fields: dict[str, object] = {}
     for name, count in GROWING.items():
-        kind = Tree.__annotations__[name]
-        fields[name] = np.zeros(sizes[count], dtype=np.float64 if "Float" in str(kind) else np.int64)
-    classes = problem.classes
+        shape = (sizes[count], COLUMNS[name]) if name in COLUMNS else (sizes[count],)
+        fields[name] = np.zeros(shape, dtype=np.float64 if name in FLOATS else np.int64)
+    bins = np.zeros((BINS + 1, BINS, 2))
+    bins[BINS, 0] = corner.min(initial=0.0), corner.max(initial=0.0)
     tree = Tree(
         **fields,  # type: ignore[arg-type]
         counts=np.zeros(10, dtype=np.int64),
-        newest_vector=np.full(classes, -1, dtype=np.int64),
-        newest_log=np.full(classes, -1, dtype=np.int64),
-        oldest_vector=np.full(classes, -1, dtype=np.int64),
+        head=np.full((problem.classes, 3), -1, dtype=np.int64),
         corner=corner.astype(np.float64),
         option_bound=option_bound.astype(np.float64),
         bucket=np.full(1 << 12, -1, dtype=np.int64),
@@ -138,10 +134,9 @@ def new_tree(
         other=np.zeros(widest),
         touched=np.zeros(widest, dtype=np.int64),
         path=np.zeros(depth + 1, dtype=np.int64),
-        span=np.array([corner.min(initial=0.0), corner.max(initial=0.0)]),
-        bins=np.zeros((BINS, BINS, 2)),
+        bins=bins,
     )
-    for y in range(classes):
+    for y in range(problem.classes):
         for vector, option in zip(vectors[y], options[y], strict=True):
             _first_vector(tree, y, int(option), vector)
     return tree
@@ -152,12 +147,11 @@ BINS: Final = 10
 
 def _first_vector(tree: Tree, y: int, option: int, vector: FloatArray) -> None:
     m, start = int(tree.counts[VECTORS]), int(tree.counts[NUMBERS])
-    tree.vector_class[m], tree.vector_option[m], tree.vector_start[m] = y, option, start
-    tree.vector_previous[m], tree.vector_links[m] = tree.newest_vector[y], -1
+    tree.vector[m] = y, option, start, tree.head[y, NEWEST_VECTOR], -1
     tree.number[start : start + len(vector)] = vector
-    if tree.oldest_vector[y] < 0:
-        tree.oldest_vector[y] = m
-    tree.newest_vector[y] = m
+    if tree.head[y, OLDEST_VECTOR] < 0:
+        tree.head[y, OLDEST_VECTOR] = m
+    tree.head[y, NEWEST_VECTOR] = m
     tree.counts[VECTORS] += 1
     tree.counts[NUMBERS] += len(vector)
 
@@ -180,7 +174,7 @@ def grown(tree: Tree, least: IntArray) -> Tree:
         array = getattr(tree, name)
         needed = int(tree.counts[count] + 2 * least[count])
         if len(array) < needed:
-            bigger = np.zeros(max(needed, 2 * len(array)), dtype=array.dtype)
+            bigger = np.zeros((max(needed, 2 * len(array)), *array.shape[1:]), dtype=array.dtype)
             bigger[: len(array)] = array
             changes[name] = bigger
     return tree._replace(**changes)  # type: ignore[arg-type]

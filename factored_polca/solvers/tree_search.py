@@ -35,9 +35,19 @@ from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.models.errors import ModelError
 from factored_polca.solvers import tree_beliefs, tree_bounds
 from factored_polca.solvers.belief_tree import (
+    AT,
+    BEST,
+    FIRST_CHOICE,
+    FIRST_LINK,
     LOG,
+    LOWER,
+    NEWEST_VECTOR,
     NODES,
+    OF_CLASS,
+    OLDER,
+    OPTION,
     TRIALS,
+    UPPER,
     VECTORS,
     grown,
     merge_widening,
@@ -123,7 +133,7 @@ class Search:
             useful = useful[np.argsort(-(base - values)[useful], kind="stable")[:MOST_POINTS]]
         for point in useful.tolist():
             node = self._node(int(above.points.y[point]), above.belief(point))
-            self.tree.upper[node] = min(self.tree.upper[node], values[point])
+            self.tree.bound[node, UPPER] = min(self.tree.bound[node, UPPER], values[point])
             tree_bounds.log_point(self.tree, node)
 
     # -- bounds --------------------------------------------------------------------------------
@@ -131,12 +141,14 @@ class Search:
     @property
     def root_lower(self) -> FloatArray:
         """[root], rounding taken off."""
-        return self.tree.lower[self.roots] - self.problem.slack
+        lower: FloatArray = self.tree.bound[self.roots, LOWER] - self.problem.slack
+        return lower
 
     @property
     def root_upper(self) -> FloatArray:
         """[root], rounding and merging added."""
-        return np.maximum(self.tree.upper[self.roots] + self.widening, self.root_lower)
+        upper: FloatArray = self.tree.bound[self.roots, UPPER] + self.widening
+        return np.maximum(upper, self.root_lower)
 
     def note(self) -> None:
         """Write the bounds at b0 into the history, and tell who waits for them."""
@@ -211,16 +223,16 @@ class Search:
         tree, problem = self.tree, self.problem
         gain = 1e-3 * self.demand.gap
         for _ in range(self.style.raising_rounds):
-            opened = np.flatnonzero(tree.first_choice[: tree.counts[NODES]] >= 0)
+            opened = np.flatnonzero(tree.node[: tree.counts[NODES], FIRST_CHOICE] >= 0)
             self.generator.shuffle(opened)
-            before = tree.lower.copy()
+            before = tree.bound[:, LOWER].copy()
             for part in np.array_split(opened, max(1, len(opened) // 200)):
                 tree = self.tree = grown(self.tree, self.least * len(part))
                 tree_bounds.raise_lower(
                     problem.arrays, tree, part, before, problem.discount, gain, self.least
                 )
                 self.demand.poll()
-        used = np.zeros(max(len(tree.upper), len(tree.vector_class)), dtype=np.int64)
+        used = np.zeros(max(len(tree.bound), len(tree.vector)), dtype=np.int64)
         tree_bounds.tidy(tree, used)
         self.next_tidy = int(tree.counts[VECTORS] * self.style.tidy_factor) + 50
 
@@ -268,23 +280,23 @@ class Search:
         """The vectors in the lists and those at the roots, closed under links."""
         tree, problem = self.tree, self.problem
         keep = np.zeros(int(tree.counts[VECTORS]), dtype=np.bool_)
-        for newest in tree.newest_vector.tolist():
+        for newest in tree.head[:, NEWEST_VECTOR].tolist():
             while newest >= 0:
                 keep[newest] = True
-                newest = int(tree.vector_previous[newest])
-        keep[tree.best_vector[self.roots]] = True
+                newest = int(tree.vector[newest, OLDER])
+        keep[tree.node[self.roots, BEST]] = True
         for m in range(len(keep) - 1, -1, -1):  # links lead to older vectors
-            link = int(tree.vector_links[m])
+            link = int(tree.vector[m, FIRST_LINK])
             if keep[m] and link >= 0:
-                j = int(tree.vector_option[m])
+                j = int(tree.vector[m, OPTION])
                 keep[tree.links[link : link + len(problem.branch_range(j))]] = True
         vectors: list[FloatArray] = []
         actions: list[IntArray] = []
         for y in range(problem.classes):
-            mine = np.flatnonzero(keep & (tree.vector_class[: len(keep)] == y))
-            places = tree.vector_start[mine][:, None] + np.arange(problem.size(y))[None, :]
+            mine = np.flatnonzero(keep & (tree.vector[: len(keep), OF_CLASS] == y))
+            places = tree.vector[mine, AT][:, None] + np.arange(problem.size(y))[None, :]
             vectors.append(tree.number[places])
-            actions.append(problem.option_action[tree.vector_option[mine]])
+            actions.append(problem.option_action[tree.vector[mine, OPTION]])
         return problem.policy(vectors, actions, "lower")
 
 

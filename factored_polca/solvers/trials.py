@@ -15,13 +15,29 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from factored_polca.explicit.arrays import FloatArray, IntArray
-from factored_polca.solvers.belief_tree import BINS, CHOICES, LINKS, LOG, NUMBERS, TRIALS, VECTORS, Tree
+from factored_polca.explicit.arrays import IntArray
+from factored_polca.solvers.belief_tree import (
+    BASE,
+    BINS,
+    CHOICES,
+    CLASS,
+    COUNT,
+    FIRST_CHOICE,
+    LINKS,
+    LOG,
+    LOWER,
+    NUMBERS,
+    REWARD,
+    START,
+    TRIALS,
+    UPPER,
+    VECTORS,
+    Tree,
+)
 from factored_polca.solvers.compiled import kernel
 from factored_polca.solvers.pomdp_problem import Arrays
 from factored_polca.solvers.tree_bounds import (
     back_up,
-    lower_of_choice,
     refresh_lower,
     refresh_upper,
     settle,
@@ -35,28 +51,45 @@ LEARNING: Final = 0.1
 def has_room(t: Tree, least: IntArray) -> bool:
     """Whether one more node can be opened and backed up."""
     return bool(
-        t.counts[VECTORS] + least[VECTORS] <= len(t.vector_class)
+        t.counts[VECTORS] + least[VECTORS] <= len(t.vector)
         and t.counts[NUMBERS] + least[NUMBERS] <= len(t.number)
         and t.counts[LINKS] + least[LINKS] <= len(t.links)
-        and t.counts[LOG] + least[LOG] <= len(t.log_node)
-        and t.counts[CHOICES] + least[CHOICES] <= len(t.choice_upper)
+        and t.counts[LOG] + least[LOG] <= len(t.log)
+        and t.counts[CHOICES] + least[CHOICES] <= len(t.choice)
     )
 
 
 @kernel
-def excess_branch(a: Arrays, t: Tree, n: int, j: int, allowed: float) -> tuple[int, int, float]:
-    """(child place, child, weighted excess) of the branch with the largest excess gap."""
-    best, place, child = 0.0, -1, -1
-    h = t.first_child[t.first_choice[n] + j - a.first_option[t.node_class[n]]]
+def excess_branch(a: Arrays, t: Tree, j: int, c: int, allowed: float, any_gap: bool) -> int:
+    """The place of the child with the largest P(k) (u - l - allowed), if positive; else -1.
+
+    With `any_gap`, where no gap is wider than allowed, the child with the largest P(k) (u - l).
+    """
+    best, place, second, spare = 0.0, -1, 0.0, -1
+    h = t.first_child[c]
     for _ in range(a.first_branch[j], a.first_branch[j + 1]):
         m = t.child[h]
         if m >= 0:
             refresh_lower(t, m)
-            excess = t.chance[h] * (t.upper[m] - t.lower[m] - allowed)
-            if excess > best:
-                best, place, child = excess, h, m
+            gap = t.bound[m, UPPER] - t.bound[m, LOWER]
+            if t.chance[h] * (gap - allowed) > best:
+                best, place = t.chance[h] * (gap - allowed), h
+            if t.chance[h] * gap > second:
+                second, spare = t.chance[h] * gap, h
         h += 1
-    return place, child, best
+    return spare if place < 0 and any_gap else place
+
+
+@kernel
+def known_lower(a: Arrays, t: Tree, j: int, c: int, discount: float) -> float:
+    """The lower bound of an expanded choice from those of its children as they are."""
+    total = 0.0
+    h = t.first_child[c]
+    for _ in range(a.first_branch[j], a.first_branch[j + 1]):
+        if t.child[h] >= 0:
+            total += t.chance[h] * t.bound[t.child[h], LOWER]
+        h += 1
+    return float(t.choice[c, REWARD] + discount * total)
 
 
 @kernel
@@ -73,105 +106,78 @@ def way_back(a: Arrays, t: Tree, depth: int, discount: float, threshold: float, 
 
 
 @kernel
-def hsvi_trial(
-    a: Arrays, t: Tree, root: int, discount: float, epsilon: float, threshold: float, least: IntArray
-) -> bool:
-    """One trial of HSVI2 with the width `epsilon` at the root; False: it ended early for want of room."""
-    depth, n, allowed = 0, root, epsilon
-    while has_room(t, least):
-        j = settle(a, t, n, discount, threshold, least)
-        if j < 0:
-            break
-        t.path[depth] = n
-        depth += 1
-        if discount == 0.0 or depth == len(t.path):
-            return way_back(a, t, depth - 1, discount, threshold, least)
-        allowed /= discount
-        _, child, _ = excess_branch(a, t, n, j, allowed)
-        if child < 0:
-            return way_back(a, t, depth - 1, discount, threshold, least)
-        n = child
-    way_back(a, t, depth - 1, discount, threshold, least)
-    return False
-
-
-@kernel
-def bin_of(a: Arrays, t: Tree, n: int) -> tuple[int, int]:
-    """The bin of a node by what the corners gave for it, and by its normalised entropy."""
-    y = t.node_class[n]
-    low, high = t.span[0], t.span[1]
-    by_value = int((t.base[n] - low) / (high - low) * BINS) if high > low else 0
-    entropy = 0.0
-    for e in range(t.entry_start[n], t.entry_start[n] + t.entry_count[n]):
-        entropy -= t.entry_weight[e] * math.log(t.entry_weight[e])
-    size = a.offset[y + 1] - a.offset[y]
-    by_entropy = int(entropy / math.log(size) * BINS) if size > 1 else 0
-    return min(max(by_value, 0), BINS - 1), min(max(by_entropy, 0), BINS - 1)
-
-
-@kernel
 def predicted(a: Arrays, t: Tree, n: int) -> float:
-    """The value to expect of a node: the mean of lower bounds in its bin; its upper bound if empty."""
-    i, k = bin_of(a, t, n)
-    return float(t.bins[i, k, 0] if t.bins[i, k, 1] > 0.0 else t.upper[n])
+    """The value to expect of a node: the mean of lower bounds in its bin, this node's now among them.
 
-
-@kernel
-def learn(a: Arrays, t: Tree, n: int) -> None:
-    """Move the mean of a node's bin towards its lower bound."""
-    i, k = bin_of(a, t, n)
+    Bins are by what the corners gave for the node, and by its normalised entropy.
+    """
+    low, high = t.bins[BINS, 0, 0], t.bins[BINS, 0, 1]
+    by_value = int((t.bound[n, BASE] - low) / (high - low) * BINS) if high > low else 0
+    entropy = 0.0
+    for e in range(t.node[n, START], t.node[n, START] + t.node[n, COUNT]):
+        entropy -= t.entry_weight[e] * math.log(t.entry_weight[e])
+    size = a.offset[t.node[n, CLASS] + 1] - a.offset[t.node[n, CLASS]]
+    by_entropy = int(entropy / math.log(size) * BINS) if size > 1 else 0
+    i, k = min(max(by_value, 0), BINS - 1), min(max(by_entropy, 0), BINS - 1)
     t.bins[i, k, 1] += 1.0
-    t.bins[i, k, 0] += (t.lower[n] - t.bins[i, k, 0]) * max(1.0 / t.bins[i, k, 1], LEARNING)
-
-
-@kernel
-def sarsop_trial(
-    a: Arrays, t: Tree, root: int, discount: float, epsilon: float, threshold: float, least: IntArray
-) -> bool:
-    """One trial of SARSOP with the width `epsilon` at the root; False: it ended early for want of room."""
-    depth, n, allowed = 0, root, epsilon
-    lower_target, upper_target = t.lower[root], t.lower[root] + epsilon
-    while has_room(t, least):
-        j = settle(a, t, n, discount, threshold, least)
-        if j < 0:
-            break
-        t.path[depth] = n
-        depth += 1
-        refresh_lower(t, n)
-        learn(a, t, n)
-        done = predicted(a, t, n) <= lower_target and depth > 1
-        if done and t.upper[n] <= max(upper_target, t.lower[n] + allowed):
-            return way_back(a, t, depth - 1, discount, threshold, least)
-        if discount == 0.0 or depth == len(t.path):
-            return way_back(a, t, depth - 1, discount, threshold, least)
-        c = t.first_choice[n] + j - a.first_option[t.node_class[n]]
-        worth = max(t.lower[n], lower_of_choice(a, t, j, c, discount))
-        lower_target, upper_target = max(lower_target, worth), max(upper_target, worth + allowed)
-        allowed /= discount
-        place, child, _ = excess_branch(a, t, n, j, allowed)
-        if child < 0:  # no gap is too wide; a lower bound may still be worth raising
-            place, child, _ = excess_branch(a, t, n, j, 0.0)
-        if child < 0:
-            return way_back(a, t, depth - 1, discount, threshold, least)
-        lower_target = passed_on(a, t, j, c, place, lower_target, discount, t.lower)
-        upper_target = passed_on(a, t, j, c, place, upper_target, discount, t.upper)
-        n = child
-    way_back(a, t, depth - 1, discount, threshold, least)
-    return False
+    t.bins[i, k, 0] += (t.bound[n, LOWER] - t.bins[i, k, 0]) * max(1.0 / t.bins[i, k, 1], LEARNING)
+    return float(t.bins[i, k, 0])
 
 
 @kernel
 def passed_on(
-    a: Arrays, t: Tree, j: int, c: int, place: int, target: float, discount: float, bound: FloatArray
+    a: Arrays, t: Tree, j: int, c: int, place: int, target: float, discount: float, side: int
 ) -> float:
-    """What the child at `place` must be worth for the choice to reach `target`, the others at `bound`."""
-    rest = target - t.choice_reward[c]
+    """What the child at `place` must be worth for the choice to reach `target`, the others at `side`."""
+    rest = target - t.choice[c, REWARD]
     h = t.first_child[c]
     for _ in range(a.first_branch[j], a.first_branch[j + 1]):
         if t.child[h] >= 0 and h != place:
-            rest -= discount * t.chance[h] * bound[t.child[h]]
+            rest -= discount * t.chance[h] * t.bound[t.child[h], side]
         h += 1
     return float(rest / (discount * t.chance[place]))
+
+
+@kernel
+def descend(
+    a: Arrays,
+    t: Tree,
+    root: int,
+    discount: float,
+    epsilon: float,
+    threshold: float,
+    sarsop: bool,
+    least: IntArray,
+) -> int:
+    """The way down of one trial into `t.path`; its length, negative where it ended for want of room."""
+    depth, n, allowed = 0, root, epsilon
+    lower_target, upper_target = t.bound[root, LOWER], t.bound[root, LOWER] + epsilon
+    while has_room(t, least):
+        j = settle(a, t, n, discount, threshold, least)
+        if j < 0:
+            break
+        t.path[depth] = n
+        depth += 1
+        if discount == 0.0 or depth == len(t.path):
+            return depth
+        c = t.node[n, FIRST_CHOICE] + j - a.first_option[t.node[n, CLASS]]
+        if sarsop:
+            refresh_lower(t, n)
+            expected = predicted(a, t, n)
+            narrow = t.bound[n, UPPER] <= max(upper_target, t.bound[n, LOWER] + allowed)
+            if narrow and depth > 1 and expected <= lower_target:
+                return depth
+        place = excess_branch(a, t, j, c, allowed / discount, sarsop)
+        if place < 0:
+            return depth
+        if sarsop:
+            worth = max(t.bound[n, LOWER], known_lower(a, t, j, c, discount))
+            lower_target, upper_target = max(lower_target, worth), max(upper_target, worth + allowed)
+            lower_target = passed_on(a, t, j, c, place, lower_target, discount, LOWER)
+            upper_target = passed_on(a, t, j, c, place, upper_target, discount, UPPER)
+        allowed /= discount
+        n = t.child[place]
+    return -depth - 1
 
 
 ALL_CLOSE, USED_UP, NO_ROOM, TO_TIDY = range(4)
@@ -201,15 +207,16 @@ def search(
         for n in roots:
             refresh_lower(t, n)
             refresh_upper(t, n)
-            if t.upper[n] - t.lower[n] > widest:
-                widest, root = t.upper[n] - t.lower[n], n
+            if t.bound[n, UPPER] - t.bound[n, LOWER] > widest:
+                widest, root = t.bound[n, UPPER] - t.bound[n, LOWER], n
         if widest <= gap:
             return ALL_CLOSE
         epsilon = max(gap, share * widest)
-        if sarsop:
-            whole = sarsop_trial(a, t, root, discount, epsilon, epsilon * fine, least)
-        else:
-            whole = hsvi_trial(a, t, root, discount, epsilon, epsilon * fine, least)
+        depth = descend(a, t, root, discount, epsilon, epsilon * fine, sarsop, least)
+        whole = depth >= 0
+        if not whole:
+            depth = -depth - 1
+        whole = way_back(a, t, depth - 1, discount, epsilon * fine, least) and whole
         if not whole:
             return NO_ROOM
         if t.counts[VECTORS] >= tidy_at:
