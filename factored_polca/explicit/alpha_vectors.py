@@ -6,7 +6,8 @@ where y runs over what is seen of the state (`ArrayPOMDP.observed`; one y where 
 alpha has an action, and the policy takes the action of the maximum (Smallwood & Sondik 1973; kept
 apart by y: Ong, Png, Hsu & Lee 2010).  States in no set have the value 0.
 
-Ties: of the vectors within `TIE` * max(1, |V|) of the best the lowest action number is taken.
+Ties: of the vectors within `TIE` * max(1, |V|) of the best, which is rounding, the lowest action number
+is taken; over all steps that may cost TIE * max(1, |V|) / (1 - gamma).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 
 from factored_polca.explicit.arrays import FloatArray, IntArray
 
-TIE: Final = 1e-9
+TIE: Final = 1e-13
 
 Meaning = Literal["exact", "lower", "heuristic"]
 """What the maximum is: the value itself, what the policy earns at least, or only a preference."""

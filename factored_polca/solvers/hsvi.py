@@ -20,6 +20,6 @@ def solve_hsvi(problem: Problem, demand: Demand | None = None) -> POMDPSolution:
     """Bounds on V* at the roots and a policy that earns the lower one; `iterations` counts trials.
 
     Raises:
-        ModelError: no discount below 1, or a gap below what rounding leaves certain.
+        ModelError: no discount below 1, or a gap that is not positive.
     """
     return run_search(problem, Demand() if demand is None else demand, STYLE)

@@ -63,6 +63,8 @@ from factored_polca.solvers.pomdp_result import Bounds, Demand, POMDPSolution
 from factored_polca.solvers.result import Guarantee, Status
 from factored_polca.solvers.trials import ALL_CLOSE, NO_ROOM, TO_TIDY, search
 
+MEMORY_LIMIT: Final = 6 << 30
+"""Bytes that the tree may take unless a caller says otherwise."""
 MAXIMUM_DEPTH: Final = 2000
 MOST_POINTS: Final = 4000
 """Points of the delayed bound that are taken over, the most useful first."""
@@ -162,18 +164,21 @@ class Search:
 
     # -- the loop ------------------------------------------------------------------------------
 
-    def run(self) -> Status:
-        """Search until the gap is reached or a limit."""
+    def run(self, trials: int | None = None) -> Status:
+        """Search until the gap is reached or a limit; `trials` in all, the demand's number by default.
+
+        May be called again to go on.
+        """
+        limit = self.demand.iterations if trials is None else trials
         try:
             while True:
                 self.demand.poll()
                 if size_in_bytes(self.tree) > self.memory_limit:
                     return "memory limit"
-                done = int(self.tree.counts[TRIALS])
-                if self.demand.iterations is not None and done >= self.demand.iterations:
+                if limit is not None and int(self.tree.counts[TRIALS]) >= limit:
                     return "iteration limit"
-                if self._batch(done):
-                    return "converged"
+                if self._batch(limit):
+                    return "converged" if self.widest_gap <= self.demand.gap else "rounding limit"
         except TimeIsUp:
             return "time limit"
         except KeyboardInterrupt:
@@ -181,15 +186,21 @@ class Search:
 
     @property
     def goal(self) -> float:
-        """The gap to reach in the tree, so that widening included it is what was asked for."""
-        return self.demand.gap - self.widening - self.problem.slack
+        """The gap to reach in the tree: with rounding and merging, what was asked for, if it can be had."""
+        allowance = self.widening + self.problem.slack
+        return max(self.demand.gap - allowance, allowance)
 
-    def _batch(self, done: int) -> bool:
+    @property
+    def widest_gap(self) -> float:
+        """max over the roots of upper - lower."""
+        return float((self.root_upper - self.root_lower).max(initial=0.0))
+
+    def _batch(self, limit: int | None) -> bool:
         """Trials up to the next multiple of the batch, in slices of about 0.1 s; whether done."""
         style, problem = self.style, self.problem
-        target = (done // style.batch + 1) * style.batch
-        if self.demand.iterations is not None:
-            target = min(target, self.demand.iterations)
+        target = (int(self.tree.counts[TRIALS]) // style.batch + 1) * style.batch
+        if limit is not None:
+            target = min(target, limit)
         while int(self.tree.counts[TRIALS]) < target:
             started = time.perf_counter()
             code = search(
@@ -254,7 +265,7 @@ class Search:
             tree_bounds.refresh_upper(self.tree, node)
         self.note()
         last, policy = self.history[-1], self._policy()
-        widest = float((self.root_upper - self.root_lower).max(initial=0.0))
+        widest = self.widest_gap
         text = f"the optimum at the start lies in [lower, upper], {last.upper - last.lower:.3g} wide, "
         text += "and the policy earns at least lower; rounding included"
         if len(self.roots) > sum(root.weight > 0 for root in self.problem.roots):
@@ -311,12 +322,12 @@ def _depth(run: Search) -> int:
 
 
 def run_search(
-    problem: Problem, demand: Demand, style: Style, memory_limit: int = 6 << 30
+    problem: Problem, demand: Demand, style: Style, memory_limit: int = MEMORY_LIMIT
 ) -> POMDPSolution:
     """Bounds and a policy by trials; `demand.iterations` counts trials, `memory_limit` bytes.
 
     Raises:
-        ModelError: no discount below 1, or a gap that is not positive or below what rounding allows.
+        ModelError: no discount below 1, or a gap that is not positive.
     """
     if not problem.discount < 1:
         raise ModelError(
@@ -328,11 +339,6 @@ def run_search(
     if problem.classes == 0:
         return _nothing(problem, style)
     run = Search(problem, demand, style, memory_limit)
-    if run.goal <= 0:
-        raise ModelError(
-            f"a gap of {demand.gap:g} is below what rounding leaves certain here, "
-            f"{run.widening + problem.slack:.2g}; ask for more"
-        )
     return run.solution(run.run())
 
 
