@@ -6,6 +6,7 @@ import argparse
 import os
 import secrets
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,7 @@ def model_data(model: Model, tasks: TaskHierarchy | None) -> dict[str, Any]:
             "changes": [name for name, _ in action.effects],
             "parents": sorted({shown_reference(r) for _, e in action.effects for r in references(e)}),
             "always_applicable": str(action.applicable) == "true",
+            "senses": [name for name, _ in action.senses],
         }
         for action in model.actions
     ]
@@ -110,6 +112,7 @@ def model_data(model: Model, tasks: TaskHierarchy | None) -> dict[str, Any]:
         "states": model.states,
         "observability": model.observability,
         "discount": str(model.discount),
+        "horizon": model.horizon,
         "features": [
             {"name": f.name, "values": list(f.values), "observed": f.observed} for f in model.features
         ],
@@ -146,42 +149,74 @@ def values_text(values: list[Value]) -> str:
     return ", ".join(shown if len(shown) <= 10 else [*shown[:6], "...", shown[-1]])
 
 
+LONGEST_LIST = 40
+"""Rows of a table before the rest is summed up."""
+
+
 def print_model(data: dict[str, Any], output: Output) -> None:
     """A model's figures for people."""
-    observed = "fully" if data["observability"] == "full" else "partially"
+    partial = data["observability"] != "full"
+    steps = "" if data["horizon"] is None else f", {data['horizon']} steps"
     output.line(
-        f"[bold]{escape(data['model'])}[/]: {big(data['states'])} states, {len(data['features'])} "
-        f"features, {len(data['actions'])} actions, {observed} observed, discount {data['discount']}"
+        f"[bold]{escape(data['model'])}[/]: {big(data['states'])} states, "
+        f"{counted(len(data['features']), 'feature')}, {counted(len(data['actions']), 'action')}, "
+        f"{'partially' if partial else 'fully'} observed, discount {data['discount']}{steps}"
     )
-    table = make_table("features", {"name": "left", "values": "left", "changed by": "left"})
     changed = Counter(name for action in data["actions"] for name in action["changes"])
-    for feature in data["features"][:40]:
-        values = f"{len(feature['values'])}: {values_text(feature['values'])}"
-        table.add_row(escape(feature["name"]), escape(values), f"{changed[feature['name']]} actions")
-    if len(data["features"]) > 40:
-        table.add_row(f"... {len(data['features']) - 40} more", "", "")
-    output.table(table)
-    table = make_table("actions", {"name": "left", "changes": "left", "depends on": "left"})
-    for action in data["actions"][:40]:
-        table.add_row(
-            escape(action["name"]), escape(shorten(", ".join(action["changes"]), 60)),
-            escape(shorten(", ".join(action["parents"]), 60)),
-        )  # fmt: skip
-    if len(data["actions"]) > 40:
-        table.add_row(f"... {len(data['actions']) - 40} more", "", "")
-    output.table(table)
-    if data["tasks"]:
-        table = make_table("tasks", {"name": "left", "actions": "left", "ends where": "left"})
-        for task in data["tasks"][:40]:
-            table.add_row(
-                escape(task["name"]),
-                escape(shorten(", ".join(task["actions"]), 60)),
-                escape(task["terminal"]),
+    rows = [
+        (
+            f["name"],
+            f"{len(f['values'])}: {values_text(f['values'])}",
+            counted(changed[f["name"]], "action") + (", always seen" if f["observed"] else ""),
+        )
+        for f in data["features"]
+    ]
+    print_rows(output, "features", ("name", "values", "changed by"), rows)
+    if partial:
+        sensed = Counter(name for action in data["actions"] for name in action["senses"])
+        rows = [
+            (
+                o["name"],
+                f"{len(o['values'])}: {values_text(o['values'])}",
+                counted(sensed[o["name"]], "action"),
             )
-        output.table(table)
+            for o in data["observations"]
+        ]
+        print_rows(output, "observations", ("name", "values", "sensed by"), rows)
+        if not rows:
+            output.line("no observations: blind")
+    headings = ("name", "changes", "depends on", "senses") if partial else ("name", "changes", "depends on")
+    rows_of_actions = [
+        tuple(
+            shorten(text, 60)
+            for text in (a["name"], *(", ".join(a[k]) for k in ("changes", "parents", "senses")))
+        )[: len(headings)]
+        for a in data["actions"]
+    ]
+    print_rows(output, "actions", headings, rows_of_actions)
+    tasks = [(t["name"], shorten(", ".join(t["actions"]), 60), t["terminal"]) for t in data["tasks"]]
+    if tasks:
+        print_rows(output, "tasks", ("name", "actions", "ends where"), tasks)
     if data["parameters"]:
         listed = ", ".join(f"{name} = {value}" for name, value in data["parameters"].items())
         output.line(f"parameters (--set NAME=VALUE): {escape(listed)}")
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 action`, `2 actions`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def print_rows(
+    output: Output, title: str, headings: tuple[str, ...], rows: Sequence[tuple[str, ...]]
+) -> None:
+    """A table of texts, the end of a long one left out."""
+    table = make_table(title, dict.fromkeys(headings, "left"))
+    for row in rows[:LONGEST_LIST]:
+        table.add_row(*map(escape, row))
+    if len(rows) > LONGEST_LIST:
+        table.add_row(f"... {len(rows) - LONGEST_LIST} more", *[""] * (len(headings) - 1))
+    output.table(table)
 
 
 def check(arguments: argparse.Namespace, output: Output) -> int:

@@ -14,6 +14,7 @@ from fractions import Fraction
 from math import lcm, prod
 
 from factored_polca.diagrams import Diagram, choose, leaves
+from factored_polca.models import Fault, ModelError
 from factored_polca.symbolic import NumericView, SymbolicModel, Term
 
 
@@ -71,7 +72,11 @@ def flat_process(
 
     Raises:
         KeyError: an unknown action; the message lists those there are.
+        ModelError: a partially observed model, whose observations this would overlook.
     """
+    if symbolic.model.observability != "full":
+        message = "minimising partially observed models is not part of this version"
+        raise ModelError([Fault(message, ("observability",), "solve takes the model as it is")])
     names = [action.name for action in symbolic.actions]
     wanted = names if actions is None else list(actions)
     for name in wanted:

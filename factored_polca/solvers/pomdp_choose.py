@@ -9,8 +9,10 @@
    iteration on policy graphs for some exact backups, then SARSOP again.  Bounds are joined, and the
    policy with the better lower bound is returned.
 
-"exact" does the same, but up to `VERY_FEW_STATES` states policy iteration comes before SARSOP.  With a horizon both are
-value iteration over vectors with incremental pruning; "witness" is that with the witness algorithm.
+"exact" does the same, but up to `VERY_FEW_STATES` states policy iteration comes before SARSOP.
+
+With a horizon both are value iteration over vectors with incremental pruning; "witness" is that with
+the witness algorithm.
 """
 
 from __future__ import annotations
