@@ -39,6 +39,7 @@ from factored_polca.models import (
     Feature,
     LimitReached,
     Model,
+    ModelError,
     boolean,
     conditional,
     lottery,
