@@ -48,20 +48,22 @@ def evaluate(graph: PolicyGraph, pomdp: ArrayPOMDP) -> FloatArray:
     if not pomdp.discount < 1:
         raise ModelError("a policy graph is evaluated for a discount below 1 only")
     states, nodes = pomdp.states, graph.nodes
-    rows, columns, entries = [], [], []
-    for node in range(nodes):
-        successors = graph.successors[node]
-        for observation, matrix in enumerate(pomdp.kernel[int(graph.actions[node])]):
-            cells = matrix.tocoo()
-            target = successors[observation, pomdp.observed[cells.col]]
-            known = target >= 0
-            rows.append(node * states + cells.row[known])
-            columns.append(target[known] * states + cells.col[known])
-            entries.append(cells.data[known])
     size = nodes * states
-    place = (np.concatenate(rows), np.concatenate(columns))
-    moves = csc_array(coo_array((np.concatenate(entries), place), shape=(size, size)))
-    rewards = np.concatenate([pomdp.rewards[int(action)] for action in graph.actions])
+    moves = csc_array((size, size))
+    for action in np.unique(graph.actions).tolist():
+        mine = np.flatnonzero(graph.actions == action)
+        successors = np.array([graph.successors[node] for node in mine])  # [n, o, y]
+        for observation, matrix in enumerate(pomdp.kernel[action]):
+            cells = matrix.tocoo()
+            target = successors[:, observation, :][:, pomdp.observed[cells.col]]  # [n, cell]
+            known = target >= 0
+            rows = (mine[:, None] * states + cells.row)[known]
+            columns = (target * states + cells.col)[known]
+            chances = np.broadcast_to(cells.data, target.shape)[known]
+            moves = moves + csc_array(coo_array((chances, (rows, columns)), shape=(size, size)))
+    if nodes == 0:
+        return np.zeros((0, states))
+    rewards = pomdp.rewards[graph.actions].reshape(-1)
     system = csc_array(eye_array(size)) - pomdp.discount * moves
     values: FloatArray = splu(csc_array(system)).solve(rewards)
     return values.reshape(nodes, states)
