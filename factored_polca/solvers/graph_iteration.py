@@ -40,7 +40,7 @@ import numpy as np
 
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import FloatArray, IntArray
-from factored_polca.models.errors import ModelError
+from factored_polca.models.errors import LimitReached, ModelError
 from factored_polca.solvers.bellman_residual import excess
 from factored_polca.solvers.blind import blind_vectors
 from factored_polca.solvers.controllers import UNIT, Controllers, blind_controllers, simplest_bounds
@@ -82,6 +82,8 @@ def solve_by_graph_iteration(problem: Problem, demand: Demand, *, everywhere: bo
             status = run.go()
         except TimeIsUp:
             status = "time limit"
+        except LimitReached:  # a cross-sum of more vectors than memory holds
+            status = "memory limit"
         except KeyboardInterrupt:
             status = "interrupted"
     return run.solution(status)
