@@ -39,7 +39,6 @@ from factored_polca.models import (
     Feature,
     LimitReached,
     Model,
-    ModelError,
     boolean,
     conditional,
     lottery,
@@ -398,8 +397,3 @@ def test_a_value_that_a_feature_does_not_have_is_refused_when_a_state_is_project
     state = dict(zip(names, found.exact.state_values[0], strict=True))
     with pytest.raises(ValueError, match="has no value 'nowhere'; it has"):
         result.block({**state, names[0]: "nowhere"})
-
-
-def test_a_partially_observed_model_is_refused_rather_than_its_observations_overlooked() -> None:
-    with pytest.raises(ModelError, match=r"partially observed .*solve takes the model as it is"):
-        flat_process(compile_model(load("tiger").model))

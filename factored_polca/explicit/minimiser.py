@@ -12,10 +12,12 @@ written out in full and compared as they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 from factored_polca.explicit.exact_mdp import ExactMDP, Row
+from factored_polca.explicit.exact_pomdp import ExactPOMDP
 
 OUTSIDE = -1
 """The block number of states that were left out."""
@@ -69,6 +71,45 @@ def minimise(mdp: ExactMDP, states: Sequence[bool] | None = None) -> ExactPartit
         if count == blocks:
             return ExactPartition(tuple(block_of), blocks, initial_blocks, rounds)
         block_of, blocks = refined, count
+
+
+def minimise_pomdp(pomdp: ExactPOMDP) -> ExactPartition:
+    """The coarsest partition of a POMDP that Eq. 13 of the paper keeps stable.
+
+    Two states are equivalent if both are terminal, or if the same is seen of them and for each action
+    they have the same reward and, for each block and each observation, the same probability of entering
+    the block with that observation (Pineau, Gordon & Thrun 2003, Eq. 13; DESIGN 4).
+    """
+    states, inside = range(pomdp.states), [True] * pomdp.states
+    actions = range(len(pomdp.actions))
+    first = [
+        "terminal"
+        if pomdp.terminal[s]
+        else (pomdp.observed[s], tuple(pomdp.rewards[a][s] for a in actions))
+        for s in states
+    ]
+    block_of, blocks = _number(first, inside)
+    initial_blocks, rounds = blocks, 0
+    while True:
+        rounds += 1
+        signatures = [
+            (block_of[s], *(_entering(pomdp.kernel[a][s], block_of) for a in actions)) for s in states
+        ]
+        refined, count = _number(signatures, inside)
+        if count == blocks:
+            return ExactPartition(tuple(block_of), blocks, initial_blocks, rounds)
+        block_of, blocks = refined, count
+
+
+def _entering(
+    row: Mapping[tuple[int, int], Fraction], block_of: Sequence[int]
+) -> frozenset[tuple[tuple[int, int], Fraction]]:
+    """The probability of each (block, observation)."""
+    mass: dict[tuple[int, int], Fraction] = {}
+    for (t, o), chance in row.items():
+        key = (block_of[t], o)
+        mass[key] = mass.get(key, Fraction(0)) + chance
+    return frozenset(mass.items())
 
 
 def _number(signatures: Sequence[Hashable], inside: Sequence[bool]) -> tuple[list[int], int]:

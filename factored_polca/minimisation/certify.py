@@ -61,7 +61,7 @@ from factored_polca.minimisation.indicators import Indicators
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import make_plan, push_exact, row_table, rows_at
 from factored_polca.minimisation.quotient import exact_rewards, primitives_at
-from factored_polca.models import LimitReached
+from factored_polca.models import LimitReached, ModelError
 from factored_polca.symbolic import NumericView
 
 Int32Array = npt.NDArray[np.int32]
@@ -113,7 +113,12 @@ def certify(
         LimitReached: memory or time; `partial` is a certificate of the checks so far, not `ok` (None
             before the first check).
         ValueError: a partition of another model, or a limit below 1.
+        ModelError: a partially observed process: observations are not part of these checks.
     """
+    if process.partial:
+        raise ModelError(
+            "certify checks transitions and rewards, not observations: fully observed models only"
+        )
     if partition.symbolic.manager is not process.symbolic.manager:
         raise ValueError("the partition belongs to another compiled model than the process")
     if failure_limit < 1:

@@ -14,8 +14,8 @@ from fractions import Fraction
 from math import lcm, prod
 
 from factored_polca.diagrams import Diagram, choose, leaves
-from factored_polca.models import Fault, ModelError
 from factored_polca.symbolic import NumericView, SymbolicModel, Term
+from factored_polca.symbolic.sensing import SensedRegression
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class DecisionProcess:
     """States of a symbolic model, choices, a terminal set, and the reward of each primitive action.
 
     `rewards[p]` are the terms that primitive p earns here; `reachable` restricts attention to a set
-    of states that no choice leaves (None: all).
+    of states that no choice leaves (None: all).  `channels` are the numbers of the observations that
+    count, None where the state is seen (a partially observed process may have none: blind).
     """
 
     symbolic: SymbolicModel
@@ -53,6 +54,12 @@ class DecisionProcess:
     terminal: Diagram
     rewards: dict[int, tuple[Term, ...]]
     reachable: Diagram | None = None
+    channels: tuple[int, ...] | None = None
+
+    @property
+    def partial(self) -> bool:
+        """Whether the process is partially observed."""
+        return self.channels is not None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,11 +79,7 @@ def flat_process(
 
     Raises:
         KeyError: an unknown action; the message lists those there are.
-        ModelError: a partially observed model, whose observations this would overlook.
     """
-    if symbolic.model.observability != "full":
-        message = "minimising partially observed models is not part of this version"
-        raise ModelError([Fault(message, ("observability",), "solve takes the model as it is")])
     names = [action.name for action in symbolic.actions]
     wanted = names if actions is None else list(actions)
     for name in wanted:
@@ -84,12 +87,15 @@ def flat_process(
             raise KeyError(f"no action {name!r}; there are {', '.join(names)}")
     numbers = [names.index(name) for name in wanted]
     rewards = {n: symbolic.actions[n].rewards for n in numbers}
+    channels = None
+    if symbolic.model.observability == "partial":
+        channels = tuple(range(len(symbolic.model.observations)))
     if terminal is None:
         choices = tuple(Choice(names[n], symbolic.actions[n].app, (n,)) for n in numbers)
-        return DecisionProcess(symbolic, choices, symbolic.terminal, rewards, reachable)
+        return DecisionProcess(symbolic, choices, symbolic.terminal, rewards, reachable, channels)
     live = ~terminal
     choices = tuple(Choice(names[n], symbolic.actions[n].app & live, (n,)) for n in numbers)
-    return DecisionProcess(symbolic, choices, terminal, rewards, reachable)
+    return DecisionProcess(symbolic, choices, terminal, rewards, reachable, channels)
 
 
 class ProcessView:
@@ -98,9 +104,12 @@ class ProcessView:
     Regressions of a primitive are shared by all choices that stand for it.
     """
 
-    def __init__(self, process: DecisionProcess, numbers: NumericView) -> None:
+    def __init__(
+        self, process: DecisionProcess, numbers: NumericView, sensed: SensedRegression | None = None
+    ) -> None:
         self.process = process
         self.numbers = numbers
+        self.sensed = sensed
         self._rewards: dict[int, Diagram] = {}
 
     def app(self, choice: Choice) -> Diagram:
@@ -128,13 +137,15 @@ class ProcessView:
         return self.select(choice, {p: self._primitive_reward(p) for p in choice.primitives})
 
     def regress(self, choice: Choice, value: Diagram, memo: dict[int, Diagram]) -> Diagram:
-        """sum_x' T_c(x, x') V(x'), 0 where the choice is not applicable.
+        """sum_x' T_c(x, x') V(x'), 0 where the choice is not applicable; with observations weighed in
+        where there is a `SensedRegression`.
 
         `memo` keeps the regressions of primitives of this `value`.
         """
         for primitive in choice.primitives:
             if primitive not in memo:
-                memo[primitive] = self.numbers.regress(primitive, value)
+                regress = self.numbers.regress if self.sensed is None else self.sensed.regress
+                memo[primitive] = regress(primitive, value)
         return self.select(choice, {p: memo[p] for p in choice.primitives})
 
 
@@ -146,8 +157,13 @@ def policy_primitives(policy: Diagram, defined: Diagram, count: int) -> tuple[in
 
 
 def row_denominator(process: DecisionProcess, primitive: int) -> int:
-    """The product over features of their rows' denominators: it makes T_p(x, x') an integer everywhere."""
-    rows = process.symbolic.actions[primitive].rows.values()
+    """The product over features and channels of their rows' denominators.
+
+    It makes T_p(x, x') and T_p(x, x') P_p(o | x', x) integers everywhere.
+    """
+    action = process.symbolic.actions[primitive]
+    sensed = [action.observations[j] for j in process.channels or () if j in action.observations]
+    rows = [*action.rows.values(), *sensed]
     return prod(lcm(*(q.denominator for row in r.rows for q in row)) for r in rows)
 
 

@@ -21,10 +21,13 @@ the cleared numerator of their difference has B bits, at most B/60 of the 2.7 * 
 states in one block with different rows, rewards or masks that is fixed before the confirming draws,
 and passes with probability at most
 
-    B/60 / 2.7 * 10^16 + 2 / 2^60,
+    B/60 / 2.7 * 10^16 + (2 + J) / 2^60,   J observation channels,
 
 which is reported, raised to the number of confirming rounds that passed in a row, times the number of
 rounds that might have been the last.
+
+With observations f_c is the sensed regression (`factored_polca.symbolic.sensing`), a random multilinear
+form of the joint row over (block, observation): Eq. 13.  Observed features are separated in step 0.
 
 A block that is not split keeps its r_k (of a block that is, one part does), so that most of V, and
 with it most cached regressions, survive from pass to pass; and a choice whose f_c is the diagram it
@@ -35,7 +38,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,11 +50,12 @@ from factored_polca.diagrams import (
     Diagram,
     Field,
     MemoryLimit,
+    choose,
     pairs,
     random_prime,
     relabel,
 )
-from factored_polca.diagrams.operations import leaf_payloads
+from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.minimisation.criterion import (
     DecisionProcess,
     ProcessView,
@@ -63,6 +67,7 @@ from factored_polca.minimisation.criterion import (
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
+from factored_polca.symbolic.sensing import SensedRegression, Vanished
 
 PRIMES_IN_RANGE = 2.7e16
 """A lower bound on the number of primes in [2^60, 2^61): 2^60 / ln(2^61) = 2.72e16 (Rosser &
@@ -111,6 +116,7 @@ def minimise(
     confirmations: int = 1,
     block_limit: int | None = None,
     progress: Progress | None = None,
+    separate: Sequence[Diagram] = (),
 ) -> Minimisation:
     """The coarsest stable partition of `process` that separates different rewards.
 
@@ -119,12 +125,13 @@ def minimise(
             `collision_bound`.
         confirmations: how many confirming rounds must pass.
         block_limit: stop beyond so many blocks.
+        separate: index diagrams over states whose different values must not be merged.
 
     Raises:
         LimitReached: blocks, memory or time; `partial` is the partition so far (None if even numbering
             its blocks takes more memory than there is).
     """
-    refinement = _Refinement(process, seed, block_limit, progress)
+    refinement = _Refinement(process, seed, block_limit, progress, separate)
     start = time.perf_counter()
     try:
         refinement.run(confirmations)
@@ -145,9 +152,15 @@ class _Refinement:
     """The working state of one minimisation."""
 
     def __init__(
-        self, process: DecisionProcess, seed: int, block_limit: int | None, progress: Progress | None
+        self,
+        process: DecisionProcess,
+        seed: int,
+        block_limit: int | None,
+        progress: Progress | None,
+        separate: Sequence[Diagram] = (),
     ) -> None:
         self.process = process
+        self.separate = tuple(separate)
         self.manager = process.symbolic.manager
         self.random = random.Random(seed)
         self.generator = np.random.default_rng(seed)
@@ -172,9 +185,16 @@ class _Refinement:
         """Go on in another field, with fresh draws; start from the present partition."""
         self.field = field
         self.primes.append(field.prime)
-        self.view = ProcessView(self.process, NumericView(self.process.symbolic, field))
+        self.view = self.new_view(field)
         self.previous.clear()
         self.labels.elements = field.draw(self.generator, self.labels.blocks)
+
+    def new_view(self, field: Field) -> ProcessView:
+        """The process in a field, with fresh draws for observations."""
+        numbers = NumericView(self.process.symbolic, field)
+        channels = self.process.channels
+        sensed = None if not channels else SensedRegression(numbers, channels, self.generator)
+        return ProcessView(self.process, numbers, sensed)
 
     def run(self, confirmations: int) -> None:
         self.begin()
@@ -200,17 +220,38 @@ class _Refinement:
                 return prime
 
     def begin(self) -> None:
-        """Separate by reachability, terminal flag, applicable choices and rewards."""
+        """Separate by reachability, terminal flag, what is seen, applicable choices and rewards."""
         reachable = self.process.reachable
         terminal = self.process.terminal
         if reachable is not None:
             self.split(reachable)
             terminal = terminal & reachable
         self.split(terminal)
+        if self.process.partial:
+            self.split_seen()
+        for diagram in self.separate:
+            self.split(
+                diagram if reachable is None else choose(reachable, diagram, self.manager.constant(0))
+            )
         for choice in self.process.choices:
             self.split(self.view.app(choice))
         for choice in self.process.choices:
             self.split(self.view.reward(choice))
+
+    def split_seen(self) -> None:
+        """Separate by the observed features: what is seen at every step, the end included."""
+        symbolic = self.process.symbolic
+        for number, feature in enumerate(symbolic.model.features):
+            if feature.observed:
+                variable = node(
+                    self.manager,
+                    symbolic.now(number),
+                    [self.manager.constant(value) for value in range(len(feature.values))],
+                )
+                live = ~self.process.terminal
+                if self.process.reachable is not None:
+                    live = live & self.process.reachable
+                self.split(choose(live, variable, self.manager.constant(0)))
 
     def refine(self) -> None:
         while self.one_pass():
@@ -221,16 +262,24 @@ class _Refinement:
         before = self.labels.blocks
         memo: dict[int, Diagram] = {}
         value = relabel(self.labels.diagram, self.labels.elements, self.field)
+        try:
+            self.split_all(value, memo)
+        except Vanished:  # with a chance of some 1/p for each state
+            self.use(self.field)
+            return True
+        self.rounds += 1
+        if self.progress is not None:
+            self.progress(self.rounds, self.blocks)
+        return self.labels.blocks > before
+
+    def split_all(self, value: Diagram, memo: dict[int, Diagram]) -> None:
+        """Refine by the regression of `value` through every choice."""
         for number, choice in enumerate(self.process.choices):
             regressed = self.view.regress(choice, value, memo)
             if self.previous.get(number) == regressed:
                 continue
             self.previous[number] = regressed
             self.split(regressed)
-        self.rounds += 1
-        if self.progress is not None:
-            self.progress(self.rounds, self.blocks)
-        return self.labels.blocks > before
 
     def split(self, by: Diagram) -> None:
         """Replace the partition by the distinct pairs (block, leaf of `by`)."""
@@ -280,7 +329,8 @@ class _Refinement:
 
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
-        return difference_bits(self.process) / 60 / PRIMES_IN_RANGE + 2.0 / 2**60
+        degree = 2 + len(self.process.channels or ())
+        return difference_bits(self.process) / 60 / PRIMES_IN_RANGE + degree / 2**60
 
 
 def difference_bits(process: DecisionProcess) -> int:

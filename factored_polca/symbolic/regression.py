@@ -10,6 +10,7 @@ children before their parents.
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -37,7 +38,7 @@ from factored_polca.symbolic.rows import Term
 
 
 @dataclass
-class _Prepared:
+class Prepared:
     """The weights of one action as flat arrays for the kernel; remade after garbage collection."""
 
     handles: list[Diagram]
@@ -62,7 +63,7 @@ class NumericView:
         self.zero = self.manager.constant(0, leaf_type)
         self.one = self.manager.constant(1, leaf_type)
         self._weights: dict[tuple[int, int], list[Diagram]] = {}
-        self._prepared: dict[int, _Prepared] = {}
+        self._prepared: dict[int, Prepared] = {}
         self._options: tuple[int, npt.NDArray[np.int64]] | None = None
 
     def stored(self, values: tuple[Fraction, ...] | list[Fraction]) -> npt.NDArray[Any]:
@@ -100,10 +101,11 @@ class NumericView:
         if not compiled.rows or value.is_constant:
             return value
         if compiled.synchronic:
-            return self.expect(action, self._shift(value))
-        return self._regress_nodes(action, value)
+            return self.expect(action, self.shift(value))
+        return self.regress_nodes(self._prepare(action), value)
 
-    def _shift(self, value: Diagram) -> Diagram:
+    def shift(self, value: Diagram) -> Diagram:
+        """V over the next variables in place of the present ones."""
         levels = {2 * i: 2 * i + 1 for i in range(len(self.symbolic.order))}
         return move(value, levels)
 
@@ -116,29 +118,38 @@ class NumericView:
                 value = weighted_sum(self.weights(action, feature), parts, normalised=True)
         return value
 
-    def _prepare(self, action: int) -> _Prepared:
-        if action not in self._prepared:
-            handles: list[Diagram] = []
-            first = np.zeros(self.manager.leaf_level + 1, dtype=np.int64)
-            last = -1
-            for feature in range(len(self.symbolic.model.features)):
-                first[self.symbolic.now(feature)] = len(handles)
-                handles.extend(self.weights(action, feature))
-                if feature in self.symbolic.actions[action].rows:
-                    last = max(last, self.symbolic.now(feature))
-            key = self.manager.cache_key("regression", action, self.leaf_type)
-            self._prepared[action] = _Prepared(handles, first, last, key)
-        prepared = self._prepared[action]
-        if prepared.collections != self.manager.collections:
-            prepared.nodes = np.array([handle.node for handle in prepared.handles], dtype=np.int32)
-            prepared.collections = self.manager.collections
-        return prepared
+    def prepare(self, action: int, weights: Sequence[Sequence[Diagram]], name: Hashable) -> Prepared:
+        """The regression with `weights` [feature][value] over x, each feature's summing to 1 everywhere.
 
-    def _regress_nodes(self, action: int, value: Diagram) -> Diagram:
+        Only the features that the action changes may have other weights than what persists has.
+        `name` tells results remembered from those of other weights.
+        """
+        handles: list[Diagram] = []
+        first = np.zeros(self.manager.leaf_level + 1, dtype=np.int64)
+        last = -1
+        for feature, parts in enumerate(weights):
+            first[self.symbolic.now(feature)] = len(handles)
+            handles.extend(parts)
+            if feature in self.symbolic.actions[action].rows:
+                last = max(last, self.symbolic.now(feature))
+        key = self.manager.cache_key("regression", name, self.leaf_type)
+        return Prepared(handles, first, last, key)
+
+    def _prepare(self, action: int) -> Prepared:
+        if action not in self._prepared:
+            features = range(len(self.symbolic.model.features))
+            self._prepared[action] = self.prepare(
+                action, [self.weights(action, i) for i in features], action
+            )
+        return self._prepared[action]
+
+    def regress_nodes(self, prepared: Prepared, value: Diagram) -> Diagram:
+        """The regression of V, over the present variables, with prepared weights, node by node."""
         manager = self.manager
-        self._prepare(action)
         manager.safe_point()
-        prepared = self._prepare(action)
+        if prepared.collections != manager.collections:
+            prepared.nodes = np.array([handle.node for handle in prepared.handles], dtype=np.int32)
+            prepared.collections = manager.collections
         field_parameters = (
             self.leaf_type.parameters
             if isinstance(self.leaf_type, Field)
