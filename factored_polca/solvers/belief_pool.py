@@ -89,10 +89,9 @@ def simulate(
             continue
         chances = beliefs[mine] @ np.stack([steps(problem)[k].chance for k in branches], axis=1)
         levels = np.cumsum(chances, axis=1)
-        goes_on = levels[:, -1] > 0
-        drawn = (levels <= draws[mine, None] * levels[:, -1:]).sum(axis=1)
+        drawn = (levels <= draws[mine, None] * levels[:, -1:]).sum(axis=1)  # past the last: it ends
         for place, k in enumerate(branches):
-            those = mine[(drawn == place) & goes_on]
+            those = mine[drawn == place]
             if len(those):
                 step = steps(problem)[k]
                 compact = posteriors(step, beliefs[those])

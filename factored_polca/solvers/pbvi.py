@@ -274,9 +274,6 @@ class Run:
         blocks = best.controllers.by_class(best.vectors)
         actions = [problem.option_action[best.controllers.options[numbers]] for numbers, _ in blocks]
         count = best.controllers.count
-        seconds = time.perf_counter() - self.began
-        if not self.history or self.history[-1].lower < lower:  # stopped between finding and reporting it
-            self.history.append(Bounds(seconds, lower, upper))
         reached = (
             f"the policy earns at least `lower`, the optimum is at most `upper`: {upper - lower:.3g} apart"
         )
@@ -292,7 +289,7 @@ class Run:
             method=method,
             vectors=count,
             iterations=self.iterations,
-            seconds=seconds,
+            seconds=time.perf_counter() - self.began,
             history=tuple(self.history),
             note=f"{self.pool.count} beliefs, {count} vectors; upper bound: delayed observation, fixed",
         )

@@ -63,14 +63,14 @@ def _explore_and_settle(run: Run) -> str:
     run.set_pool(_explored(run, START, ruled=False))
     while True:
         full = run.pool.count >= run.limit
-        run.settle(_back_up_some, full)
+        run.settle(improving_backups, full)
         if run.status is not None:
             return ""
         before = run.pool.count
         if not full:
             run.set_pool(_explored(run, 2 * before, ruled=True))
         if run.pool.count == before:
-            run.settle(_back_up_some, True)
+            run.settle(improving_backups, True)
             return f"values at the largest pool, {before} beliefs, no longer rise"
 
 
@@ -101,8 +101,8 @@ def _explored(run: Run, limit: int, *, ruled: bool) -> BeliefPool:
     return pool
 
 
-def _back_up_some(run: Run, y: int) -> Nodes:
-    """Backups at beliefs of class y drawn until each value of the pool is reached again."""
+def improving_backups(run: Run, y: int) -> Nodes:
+    """Backups at beliefs of class y: drawn until each has been, or has had its value reached again."""
     beliefs, values = run.pool.beliefs[y], run.values[y]
     left = run.rng.permutation(len(beliefs))
     parts: list[Nodes] = []
