@@ -22,10 +22,11 @@ from factored_polca.solvers.belief_pool import (
     root_pool,
     simulate,
 )
-from factored_polca.solvers.pbvi import Run, solve_pbvi
+from factored_polca.solvers.pbvi import solve_pbvi
 from factored_polca.solvers.perseus import improving_backups, solve_perseus
 from factored_polca.solvers.pomdp_problem import Problem, prepare
 from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
+from factored_polca.solvers.pool_iteration import Run
 
 SOLVERS = (solve_pbvi, solve_perseus)
 TIGER = 19.371368  # pomdp-solve and APPL SARSOP agree (Cassandra's tiger.95)

@@ -22,9 +22,9 @@ import numpy as np
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.batched_backup import best_vectors
 from factored_polca.solvers.belief_pool import BeliefPool, explored
-from factored_polca.solvers.pbvi import Nodes, Run, solve_with
 from factored_polca.solvers.pomdp_problem import Problem
 from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
+from factored_polca.solvers.pool_iteration import Nodes, Run, solve_with
 from factored_polca.solvers.qmdp import option_vectors
 
 START: Final = 256
@@ -50,8 +50,9 @@ def solve_perseus(problem: Problem, demand: Demand | None = None) -> POMDPSoluti
     """Perseus with policy evaluation.
 
     `demand.iterations` counts iterations as the module's docstring says.  Without limits the run ends,
-    with the status "iteration limit", when at `pbvi.POOL` beliefs (fewer for very large classes) or at a
-    pool that runs no longer extend the values no longer rise, or after `pbvi.LAST_ROUNDS` iterations.
+    with the status "iteration limit", when at `POOL` beliefs (fewer for very large classes) or at a pool
+    that runs no longer extend the values no longer rise, or after `LAST_ROUNDS` iterations (both in
+    `pool_iteration`).
 
     Raises:
         ModelError: no discount below 1.
@@ -60,7 +61,7 @@ def solve_perseus(problem: Problem, demand: Demand | None = None) -> POMDPSoluti
 
 
 def _explore_and_settle(run: Run) -> str:
-    run.set_pool(_explored(run, START, ruled=False))
+    run.set_pool(explored_further(run, START, ruled=False))
     while True:
         full = run.pool.count >= run.limit
         run.settle(improving_backups, full)
@@ -68,13 +69,13 @@ def _explore_and_settle(run: Run) -> str:
             return ""
         before = run.pool.count
         if not full:
-            run.set_pool(_explored(run, 2 * before, ruled=True))
+            run.set_pool(explored_further(run, 2 * before, ruled=True))
         if run.pool.count == before:
             run.settle(improving_backups, True)
             return f"values at the largest pool, {before} beliefs, no longer rise"
 
 
-def _explored(run: Run, limit: int, *, ruled: bool) -> BeliefPool:
+def explored_further(run: Run, limit: int, *, ruled: bool) -> BeliefPool:
     """The run's pool, with beliefs that runs from the roots meet up to `limit` in all."""
     problem, pool = run.problem, run.pool
     limit = min(limit, run.limit)

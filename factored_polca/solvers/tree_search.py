@@ -5,6 +5,7 @@ Then trials.  Whenever there are a tenth more vectors than before,
 
 - Perseus' randomised backups run over all beliefs that were opened, a few rounds (both peers raise
   their lower bound along trials only, and stall there);
+- now and then the vectors become controllers, and what these earn is added (`tree_evaluation`);
 - vectors that are best at no opened belief, and points that were logged again since, leave the lists.
 
 After each batch of trials a sweep carries upper bounds back through the graph of beliefs without
@@ -61,11 +62,14 @@ from factored_polca.solvers.evaluation import TimeIsUp
 from factored_polca.solvers.pomdp_problem import Problem
 from factored_polca.solvers.pomdp_result import Bounds, Demand, POMDPSolution
 from factored_polca.solvers.result import Guarantee, Status
+from factored_polca.solvers.tree_evaluation import NARROW, Evaluator, with_controllers
 from factored_polca.solvers.trials import ALL_CLOSE, NO_ROOM, TO_TIDY, search
 
 MEMORY_LIMIT: Final = 6 << 30
 """Bytes that the tree may take unless a caller says otherwise."""
 MAXIMUM_DEPTH: Final = 2000
+FIRST_EVALUATION: Final = 400
+"""Vectors before policy evaluation begins."""
 MOST_POINTS: Final = 4000
 """Points of the delayed bound that are taken over, the most useful first."""
 
@@ -82,6 +86,7 @@ class Style:
     evaluate_every: int = 100
     raising_rounds: int = 3
     tidy_factor: float = 1.05
+    evaluation_factor: float = 1.5
 
 
 @dataclass
@@ -94,11 +99,13 @@ class Search:
     memory_limit: int
     began: float = field(default_factory=time.perf_counter)
     history: list[Bounds] = field(default_factory=list)
+    evaluator: Evaluator | None = None
 
     def __post_init__(self) -> None:
         problem = self.problem
         vectors, options = blind_vectors(problem, self.demand)
         above = delayed_bound(problem, demand=self.demand)
+        self.above = above
         self.least = room(problem)
         self.tree = new_tree(problem, vectors, options, above.corner_values, above.vectors, _depth(self))
         self.roots = np.array([self._node(root.y, root.belief) for root in problem.roots], dtype=np.int64)
@@ -109,6 +116,7 @@ class Search:
         self.generator = np.random.default_rng(self.demand.seed)
         self.widening = problem.slack + merge_widening(problem)
         self.next_tidy = int(self.tree.counts[VECTORS]) + 50
+        self.next_evaluation = int(self.tree.counts[VECTORS]) + FIRST_EVALUATION
         self.evaluated = 0
         self.slice = 1
         self.note()
@@ -243,9 +251,21 @@ class Search:
                     problem.arrays, tree, part, before, problem.discount, gain, self.least
                 )
                 self.demand.poll()
+        if self.tree.counts[VECTORS] >= self.next_evaluation and len(self.tree.dense) > NARROW:
+            self._evaluate()
+            tree = self.tree
         used = np.zeros(max(len(tree.bound), len(tree.vector)), dtype=np.int64)
         tree_bounds.tidy(tree, used)
         self.next_tidy = int(tree.counts[VECTORS] * self.style.tidy_factor) + 50
+
+    def _evaluate(self) -> None:
+        """Add what the controllers made of the present vectors earn."""
+        if self.evaluator is None:
+            self.evaluator = Evaluator(self.problem, self.demand, self.above)
+        found = self.evaluator.evaluated(self.tree, self.widest_gap)
+        if found.controllers.complete:
+            self.tree = with_controllers(self.tree, self.least, found.controllers, found.vectors)
+        self.next_evaluation = int(self.tree.counts[VECTORS] * self.style.evaluation_factor)
 
     def _sweep(self) -> None:
         done = int(self.tree.counts[TRIALS])
@@ -287,6 +307,15 @@ class Search:
             note=f"{int(self.tree.counts[NODES])} beliefs, {int(self.tree.counts[LOG])} updates of points",
         )
 
+    def _links(self, m: int) -> IntArray:
+        """The vectors that vector m continues with."""
+        link = int(self.tree.vector[m, FIRST_LINK])
+        if link < 0:
+            return np.zeros(0, dtype=np.int64)
+        return self.tree.links[
+            link : link + len(self.problem.branch_range(int(self.tree.vector[m, OPTION])))
+        ]
+
     def _policy(self) -> AlphaVectors:
         """The vectors in the lists and those at the roots, closed under links."""
         tree, problem = self.tree, self.problem
@@ -296,11 +325,13 @@ class Search:
                 keep[newest] = True
                 newest = int(tree.vector[newest, OLDER])
         keep[tree.node[self.roots, BEST]] = True
-        for m in range(len(keep) - 1, -1, -1):  # links lead to older vectors
-            link = int(tree.vector[m, FIRST_LINK])
-            if keep[m] and link >= 0:
-                j = int(tree.vector[m, OPTION])
-                keep[tree.links[link : link + len(problem.branch_range(j))]] = True
+        layer = np.flatnonzero(keep)
+        while len(layer):
+            followers = np.unique(
+                np.concatenate([np.zeros(0, dtype=np.int64), *map(self._links, layer.tolist())])
+            )
+            layer = followers[~keep[followers]]
+            keep[layer] = True
         vectors: list[FloatArray] = []
         actions: list[IntArray] = []
         for y in range(problem.classes):
