@@ -59,10 +59,47 @@ def _write_spudd(document: Document) -> str:
     return write_spudd(document.model)
 
 
+def _read_pomdpx(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    if overrides:
+        listed = ", ".join(overrides)
+        raise ModelError(f"POMDPX has no parameters to set ({listed}): edit the file")
+    from factored_polca.formats.pomdpx import read_pomdpx_with_warnings
+
+    model, warnings = read_pomdpx_with_warnings(text, name)
+    return Document(model, None, warnings)
+
+
+def _write_pomdpx(document: Document) -> str:
+    raise ModelError([Fault("POMDPX can be read but not written yet", hint="write a .toml file")])
+
+
+def _read_cassandra(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    if overrides:
+        listed = ", ".join(overrides)
+        raise ModelError(f"Cassandra's format has no parameters to set ({listed}): edit the file")
+    from factored_polca.formats.cassandra import read_pomdp_with_warnings
+
+    model, warnings = read_pomdp_with_warnings(text, name)
+    return Document(model, None, warnings)
+
+
+def _write_cassandra(document: Document) -> str:
+    raise ModelError([Fault("writing .POMDP is not there yet", hint="write a .toml or a .dat file")])
+
+
 _NATIVE: Final = Format("native", _read_native, _write_native)
 _SPUDD: Final = Format("SPUDD", _read_spudd, _write_spudd)
+_POMDPX: Final = Format("POMDPX", _read_pomdpx, _write_pomdpx)
+_CASSANDRA: Final = Format("Cassandra", _read_cassandra, _write_cassandra)
 
-FORMATS: Final[Mapping[str, Format]] = {".toml": _NATIVE, ".dat": _SPUDD, ".spudd": _SPUDD}
+FORMATS: Final[Mapping[str, Format]] = {
+    ".toml": _NATIVE,
+    ".dat": _SPUDD,
+    ".spudd": _SPUDD,
+    ".pomdpx": _POMDPX,
+    ".pomdp": _CASSANDRA,
+    ".mdp": _CASSANDRA,
+}
 
 
 def format_of(path: str | Path) -> Format:
