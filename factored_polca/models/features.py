@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from factored_polca.models.expressions import Constant, Operators, Reference
 from factored_polca.models.scalars import Scalar, Value, scalar
@@ -67,7 +68,33 @@ def boolean(name: str, observed: bool = False) -> Feature:
 
 def position(values: tuple[Value, ...], value: Value | Scalar) -> int | None:
     """The index of `value` in `values`, or None; `True` is not the number 1."""
+    if len(values) > FEW:
+        return positions(values).get((isinstance(value, bool), value))
     for index, candidate in enumerate(values):
         if isinstance(candidate, bool) is isinstance(value, bool) and candidate == value:
             return index
     return None
+
+
+FEW: Final = 8
+"""Values among which a search is as quick as a table."""
+
+_tables: OrderedDict[int, tuple[tuple[Value, ...], dict[tuple[bool, Value | Scalar], int]]] = OrderedDict()
+_KEPT: Final = 256
+
+
+def positions(values: tuple[Value, ...]) -> Mapping[tuple[bool, Value | Scalar], int]:
+    """(whether it is a truth value, value) -> its index in `values`; the last tables are kept.
+
+    They are found by the identity of `values`, which the entry keeps alive: hashing long tuples costs
+    as much as a search.
+    """
+    found = _tables.get(id(values))
+    if found is None:
+        table: dict[tuple[bool, Value | Scalar], int] = {}
+        for index, value in enumerate(values):
+            table.setdefault((isinstance(value, bool), value), index)
+        found = _tables[id(values)] = (values, table)
+        if len(_tables) > _KEPT:
+            _tables.popitem(last=False)
+    return found[1]

@@ -108,6 +108,8 @@ class ExpressionCompiler:
     def map(self, diagrams: Sequence[Diagram], function: Callable[..., TableValue]) -> Diagram:
         """Apply a function of exact values pointwise."""
         values = self.table.values
+        if all(diagram.is_constant for diagram in diagrams):
+            return self._constant(function(*(values[int(diagram.value)] for diagram in diagrams)))
         numbered, results = combine(diagrams, lambda *numbers: function(*(values[i] for i in numbers)))
         images = np.array([self.table.add(result) for result in results], dtype=np.uint64)
         return relabel(numbered, images, numbered.leaf_type)
@@ -170,6 +172,13 @@ class ExpressionCompiler:
             index = position(values, value)
             if index is not None:
                 cases.setdefault(case, []).append(index)
+        parts = {case: self._memo[case] for case in cases}
+        if len(cases) > 2 and min(d.level for d in (otherwise, *parts.values())) > level:
+            children = [otherwise] * len(values)
+            for case, indices in cases.items():
+                for index in indices:
+                    children[index] = parts[case]
+            return self.manager.variable(level, children)
         result = otherwise
         for case, indices in cases.items():
             result = choose(self.manager.indicator(level, indices), self._memo[case], result)
