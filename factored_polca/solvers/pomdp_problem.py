@@ -165,14 +165,22 @@ class Problem:
         largest = max(map(abs, self.reward_range)) or 1.0
         return largest / (1 - self.discount) if self.discount < 1 else float("inf")
 
-    @property
+    @cached_property
     def slack(self) -> float:
         """What rounding may do to a bound: subtracted from lower and added to upper bounds.
 
-        A backup of n entries errs by at most some n ulp of |V|; errors add up to 1 / (1 - gamma) times.
+        A backup sums as many terms as the longest row of an option has entries, over all its branches,
+        and some more; each errs by at most two units of |V|.  Errors add up to 1 / (1 - gamma) times.
         """
-        widest = int(np.diff(self.arrays.offset).max(initial=1)) + 8
-        return min(widest, 64) * 2.0**-52 * self.value_span / max(1 - self.discount, 1e-9)
+        a = self.arrays
+        terms = 8
+        for j in range(self.options):
+            entries = np.zeros(self.size(int(self.option_class[j])), dtype=np.int64)
+            for k in self.branch_range(j):
+                at = int(a.branch_rows[k])
+                entries += np.diff(a.row_start[at : at + len(entries) + 1])
+            terms = max(terms, int(entries.max(initial=0)) + len(self.branch_range(j)) + 8)
+        return terms * 2.0**-52 * self.value_span / max(1 - self.discount, 1e-9)
 
     def belief(self, y: int, belief: FloatArray) -> FloatArray:
         """A belief [n_y] over class y as one over the original states [s]."""
