@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from factored_polca.control import Controller, Decision, Poll
     from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit
+    from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
     from factored_polca.formats import Document, read, write
     from factored_polca.hierarchy import HierarchicalPlan, Options, SolvedTask, plan
     from factored_polca.hierarchy.executable import ExecutablePlan, executable
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         flat_process,
         minimise,
         reduce,
+        unreduced_pomdp,
     )
     from factored_polca.models import (
         Action,
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
     )
     from factored_polca.simulation import Simulation, simulate
     from factored_polca.solvers import MDPSolution, solve_mdp
+    from factored_polca.solvers.pomdp_choose import solve_pomdp
+    from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
     from factored_polca.symbolic import SymbolicModel, compile_model, reachable_states
 
 __version__ = "0.1.0"
@@ -57,6 +61,7 @@ __version__ = "0.1.0"
 _HOME: Final = {
     "control": ("Controller", "Decision", "Poll"),
     "diagrams": ("Aborted", "Diagram", "Manager", "MemoryLimit"),
+    "explicit.pomdp_arrays": ("ArrayPOMDP", "array_pomdp"),
     "formats": ("Document", "read", "write"),
     "hierarchy": ("HierarchicalPlan", "Options", "SolvedTask", "plan"),
     "hierarchy.executable": ("ExecutablePlan", "executable"),
@@ -65,7 +70,7 @@ _HOME: Final = {
     "library": ("domains", "load_domain"),
     "minimisation": (
         "Certificate", "Minimisation", "Partition", "Reduction", "certify", "flat_process", "minimise",
-        "reduce",
+        "reduce", "unreduced_pomdp",
     ),
     "models": (
         "Action", "Fault", "Feature", "InitialBelief", "LimitReached", "Model", "ModelError", "Observation",
@@ -73,6 +78,8 @@ _HOME: Final = {
     ),
     "simulation": ("Simulation", "simulate"),
     "solvers": ("MDPSolution", "solve_mdp"),
+    "solvers.pomdp_choose": ("solve_pomdp",),
+    "solvers.pomdp_result": ("Demand", "POMDPSolution"),
     "symbolic": ("SymbolicModel", "compile_model", "reachable_states"),
 }  # fmt: skip
 """Module -> the public names it holds."""
@@ -83,13 +90,14 @@ _OWN_NAME: Final = {"load_domain": "load"}
 _MODULE: Final = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Aborted", "Action", "Certificate", "Controller", "Decision", "Diagram", "Document", "ExecutablePlan",
-    "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached", "MDPSolution", "Manager",
-    "MemoryLimit", "Minimisation", "Model", "ModelError", "Observation", "Options", "Partition", "Poll",
-    "Reduction", "Simulation", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "__version__",
-    "boolean", "certify", "check", "check_tasks", "compile_model", "conditional", "domains", "executable",
-    "flat_process", "load_domain", "load_plan", "lottery", "minimise", "plan", "plan_report",
-    "reachable_states", "read", "reduce", "save_plan", "simulate", "solve_mdp", "uniform", "write",
+    "Aborted", "Action", "ArrayPOMDP", "Certificate", "Controller", "Decision", "Demand", "Diagram",
+    "Document", "ExecutablePlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
+    "MDPSolution", "Manager", "MemoryLimit", "Minimisation", "Model", "ModelError", "Observation",
+    "Options", "POMDPSolution", "Partition", "Poll", "Reduction", "Simulation", "SolvedTask",
+    "SymbolicModel", "Task", "TaskHierarchy", "__version__", "array_pomdp", "boolean", "certify", "check",
+    "check_tasks", "compile_model", "conditional", "domains", "executable", "flat_process", "load_domain",
+    "load_plan", "lottery", "minimise", "plan", "plan_report", "reachable_states", "read", "reduce",
+    "save_plan", "simulate", "solve_mdp", "solve_pomdp", "uniform", "unreduced_pomdp", "write",
 ]  # fmt: skip
 
 

@@ -8,12 +8,17 @@ import os
 import resource
 import sys
 import time
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_actions, parse_state
 from factored_polca.formats import destination
 from factored_polca.models import LimitReached
+
+if TYPE_CHECKING:
+    from factored_polca.simulation import Simulation
 
 SMALLEST_STORE = 1 << 20
 """Bytes without which no model fits."""
@@ -299,14 +304,24 @@ def act(arguments: argparse.Namespace, output: Output) -> int:
 
 
 def simulate(arguments: argparse.Namespace, output: Output) -> int:
-    """Run a plan on the original model."""
+    """Run a plan or a policy on the original model."""
     from factored_polca.hierarchy.plan_file import load_plan
+    from factored_polca.hierarchy.policy_file import is_policy_file, load_policy
     from factored_polca.simulation import simulate as run
+    from factored_polca.simulation import simulate_policy
 
-    plan = load_plan(arguments.plan)
+    file, asked = arguments.plan, {"episodes": arguments.episodes, "steps": arguments.steps}
+    planned: dict[str, Any]
+    perform: Callable[..., Simulation]
+    if is_policy_file(file):
+        policy = load_policy(file)
+        perform = partial(simulate_policy, policy.flat.pomdp, policy.policy)
+        planned = {f"planned_{name}": policy.report.get(name) for name in ("value", "lower", "upper")}
+    else:
+        plan = load_plan(file)
+        perform, planned = partial(run, plan), {"planned_value": plan.report.get("value")}
     with output.progress(f"simulating {arguments.episodes:,} episodes"):
-        result = run(plan, episodes=arguments.episodes, steps=arguments.steps, seed=arguments.seed)
-    planned = plan.report.get("value")
+        result = perform(**asked, seed=arguments.seed)
     data = {
         "mean": result.mean,
         "standard_error": result.standard_error,
@@ -314,18 +329,26 @@ def simulate(arguments: argparse.Namespace, output: Output) -> int:
         "steps": result.steps,
         "ended": result.ended,
         "truncation": result.truncation,
-        "planned_value": planned,
+        **planned,
         "seed": arguments.seed,
     }
     if arguments.json:
         output.result(data)
-        return 0
-    output.line(
-        f"mean return [bold]{result.mean:.6g}[/] ± {result.standard_error:.2g} (standard error, "
-        f"{result.episodes:,} episodes of at most {result.steps:,} steps, {result.ended:,} ended)"
-    )
-    if isinstance(planned, (int, float)):
-        output.line(f"planned value: {planned:.6g}")
-    if result.truncation > max(result.standard_error, 1e-6 * abs(result.mean)):
-        output.line(f"cut off: longer episodes may change the mean by up to {result.truncation:.2g}")
+    else:
+        print_simulation(data, output)
     return 0
+
+
+def print_simulation(data: dict[str, Any], output: Output) -> None:
+    """The figures of `simulate` for people."""
+    output.line(
+        f"mean return [bold]{data['mean']:.6g}[/] ± {data['standard_error']:.2g} (standard error, "
+        f"{data['episodes']:,} episodes of at most {data['steps']:,} steps, {data['ended']:,} ended)"
+    )
+    value, lower, upper = (data.get(f"planned_{name}") for name in ("value", "lower", "upper"))
+    if isinstance(value, (int, float)):
+        bounded = isinstance(lower, (int, float)) and isinstance(upper, (int, float))
+        bounds = f", the bounds {lower:.6g} .. {upper:.6g}" if bounded else ""
+        output.line(f"planned value: {value:.6g}{bounds}")
+    if data["truncation"] > max(data["standard_error"], 1e-6 * abs(data["mean"])):
+        output.line(f"cut off: longer episodes may change the mean by up to {data['truncation']:.2g}")

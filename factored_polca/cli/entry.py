@@ -11,12 +11,14 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 
 from factored_polca import __version__
 from factored_polca.models.errors import LimitReached, ModelError
 
 DESCRIPTION = """Plan factored Markov decision processes with task hierarchies: each subtask is
-minimised exactly on decision diagrams, without enumerating states, and solved."""
+minimised exactly on decision diagrams, without enumerating states, and solved.  Partially observed
+models are solved flat, state by state."""
 
 EXAMPLES = """examples:
   factored-polca plan taxi --set size=10        plan a shipped domain
@@ -24,6 +26,24 @@ EXAMPLES = """examples:
   factored-polca new robot                      write robot.toml, a model to start from
   factored-polca plan robot.toml -o robot.polca
   factored-polca simulate robot.polca --episodes 1000
+  factored-polca solve tiger -o tiger.policy    a partially observed model
+  factored-polca simulate tiger.policy
+"""
+
+SOLVE_NOTES = """solvers:
+  auto      choose by the model, and say what was done and why
+  exact     certified bounds by the best method; with --horizon exact sets of vectors
+  witness   the same with --horizon, by another algorithm: a cross-check
+  sarsop, hsvi, pbvi, perseus   point-based: a policy, and bounds on the optimum
+  qmdp, fib, blind, amdp        quick and coarse; for qmdp, fib and amdp simulate tells what they earn
+  vi, pi, mpi                   fully observed models: value, policy, modified policy iteration
+
+--gap and --epsilon are one thing: upper - lower at the start.  Without them 0.001, for exact 1e-6; fully
+observed models are solved to 1e-9 of the largest value.  There is no time limit but --time, which counts
+the solving only.  Only states that the start can reach are listed.
+
+exit status: 0 with a result, also where --time or --iterations stopped the solver; 130 after Ctrl-C, with
+the result so far printed and written if there is one; 3 where memory or another limit was reached.
 """
 
 
@@ -83,11 +103,14 @@ def parser() -> argparse.ArgumentParser:
         "--flat-blocks", type=natural, default=100_000, metavar="N",
         help="leave out the flat optimum beyond N blocks (100000)",
     )  # fmt: skip
+    sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
+    with_model(sub)
+    add_solving(sub)
     sub = command("act", "Say what a plan does in a state, and why.")
     sub.add_argument("plan", metavar="PLAN")
     sub.add_argument("--state", required=True, metavar="x=3,y=2,...", help="a value for each feature")
-    sub = command("simulate", "Run a plan on the original model.")
-    sub.add_argument("plan", metavar="PLAN")
+    sub = command("simulate", "Run a plan, or a policy that solve found, on the original model.")
+    sub.add_argument("plan", metavar="FILE", help="a plan or a policy")
     sub.add_argument("--episodes", type=counting, default=1000, metavar="N", help="1000 if not given")
     sub.add_argument(
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
@@ -100,8 +123,30 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def add_solving(sub: argparse.ArgumentParser) -> None:
+    """The options of `solve` beside the model's."""
+    sub.epilog, sub.formatter_class = SOLVE_NOTES, argparse.RawDescriptionHelpFormatter
+    sub.add_argument("--solver", default="auto", choices=FLAT_SOLVERS, metavar="NAME", help="see below")
+    sub.add_argument("--gap", type=gap, metavar="G", help="stop at upper - lower <= G at the start")
+    sub.add_argument("--epsilon", type=gap, metavar="E", help="the same as --gap")
+    sub.add_argument("--time", type=positive, metavar="SECONDS", help="solve no longer than that")
+    sub.add_argument("--iterations", type=counting, metavar="N", help="no more than N of the solver's")
+    sub.add_argument(
+        "--horizon", type=horizon, metavar="H", help="steps, or infinite; the model's if not given"
+    )
+    sub.add_argument(
+        "--discount", type=discount, metavar="D", help="such as 0.95 or 19/20; the model's if not given"
+    )
+    sub.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
+    sub.add_argument("-o", "--output", metavar="POLICY", help="write the policy to a file")
+
+
 ORDERS = ("auto", "file", "force", "spectral")
 SOLVERS = ("auto", "vi", "pi", "mpi")
+FLAT_SOLVERS = (
+    "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",
+    "pi", "mpi",
+)  # fmt: skip
 
 
 def natural(text: str) -> int:
@@ -141,15 +186,44 @@ def positive(text: str) -> float:
     return value
 
 
+def gap(text: str) -> float:
+    """A positive number, for the width of bounds."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number such as 0.001")
+    return value
+
+
+def horizon(text: str) -> int | str:
+    """A number of steps, or "infinite"."""
+    if text in ("infinite", "inf"):
+        return "infinite"
+    if not text.isdecimal() or not 0 < len(text) <= 15 or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of steps from 1 on nor infinite")
+    return int(text)
+
+
+def discount(text: str) -> Fraction:
+    """An exact number from 0 to 1: a decimal or a fraction."""
+    if re.fullmatch(r"[0-9]{0,30}\.?[0-9]{1,30}|[0-9]{1,30}/[0-9]{0,29}[1-9][0-9]{0,29}", text):
+        value = Fraction(text)
+        if 0 <= value <= 1:
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1 such as 0.95 or 19/20")
+
+
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
     from factored_polca.cli import commands as work
-    from factored_polca.cli import models
+    from factored_polca.cli import models, solve
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": work.plan, "act": work.act,
-        "simulate": work.simulate,
+        "simulate": work.simulate, "solve": solve.solve,
     }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.quotient import Quotient, make_quotient
 from factored_polca.minimisation.reduction import Reduction, reduce
 from factored_polca.minimisation.refine import Minimisation, minimise
+from factored_polca.minimisation.unreduced import Unreduced, unreduced, unreduced_mdp, unreduced_pomdp
 
 __all__ = [
     "Certificate",
@@ -15,10 +16,14 @@ __all__ = [
     "Partition",
     "Quotient",
     "Reduction",
+    "Unreduced",
     "certify",
     "flat_process",
     "make_quotient",
     "minimise",
     "partition_from",
     "reduce",
+    "unreduced",
+    "unreduced_mdp",
+    "unreduced_pomdp",
 ]
