@@ -18,10 +18,12 @@ from factored_polca.solvers.belief_tree import (
     CLASS,
     COUNT,
     FIRST_CHOICE,
+    FIRST_LINK,
     LINKS,
     NEWEST_VECTOR,
     NODES,
     NUMBERS,
+    OF_CLASS,
     OLDER,
     OPTION,
     START,
@@ -92,17 +94,20 @@ def with_controllers(tree: Tree, least: IntArray, controllers: Controllers, vect
     """`tree` with the vectors [x] of `controllers`, which must be complete, appended."""
     problem, count = controllers.problem, controllers.count
     tree = grown(tree, least * count)
-    base, at = int(tree.counts[VECTORS]), int(tree.counts[NUMBERS])
+    base, at, link = (int(tree.counts[name]) for name in (VECTORS, NUMBERS, LINKS))
     tree.number[at : at + len(vectors)] = vectors
     first_branch = problem.arrays.first_branch
-    for n, (y, j) in enumerate(
-        zip(controllers.classes.tolist(), controllers.options.tolist(), strict=True)
-    ):
-        link, branches = int(tree.counts[LINKS]), int(first_branch[j + 1] - first_branch[j])
-        tree.links[link : link + branches] = base + controllers.successors[n, :branches]
-        tree.counts[LINKS] += branches
-        tree.vector[base + n] = y, j, at + int(controllers.start[n]), tree.head[y, NEWEST_VECTOR], link
+    branches = np.diff(first_branch)[controllers.options]
+    links = link + np.concatenate([[0], np.cumsum(branches)])
+    present = np.arange(controllers.successors.shape[1])[None, :] < branches[:, None]
+    tree.links[link : links[-1]] = base + controllers.successors[present]
+    rows = tree.vector[base : base + count]
+    rows[:, OF_CLASS], rows[:, OPTION] = controllers.classes, controllers.options
+    rows[:, AT], rows[:, FIRST_LINK] = at + controllers.start[:-1], links[:-1]
+    # From here on Ctrl-C finds the tree in order at any moment: the lists come last.
+    tree.counts[LINKS], tree.counts[NUMBERS] = links[-1], at + len(vectors)
+    tree.counts[VECTORS] = base + count
+    for n, y in enumerate(controllers.classes.tolist()):
+        rows[n, OLDER] = tree.head[y, NEWEST_VECTOR]
         tree.head[y, NEWEST_VECTOR] = base + n
-    tree.counts[VECTORS] += count
-    tree.counts[NUMBERS] += len(vectors)
     return tree

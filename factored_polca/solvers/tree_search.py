@@ -178,6 +178,8 @@ class Search:
         May be called again to go on.
         """
         limit = self.demand.iterations if trials is None else trials
+        if self.above.status == "interrupted":  # Ctrl-C came while the starting bound was computed
+            return "interrupted"
         try:
             while True:
                 self.demand.poll()
