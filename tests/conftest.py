@@ -5,8 +5,14 @@ FACTORED_POLCA_DATA names, and are deselected where it is not set.
 """
 
 import os
+import signal
 
 import pytest
+
+# A shell that starts a command in the background without job control has it ignore Ctrl-C, and processes
+# hand that down.  Tests that interrupt processes would then wait for ever.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
