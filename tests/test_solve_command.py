@@ -407,7 +407,7 @@ def test_simulating_a_policy_wrongly_is_said(run_json: Run, fail: Run, folder: P
 # -- Ctrl-C --------------------------------------------------------------------------------------
 
 
-def interrupted(*arguments: str) -> tuple[int, str, str]:
+def interrupted(*arguments: str, after_seconds: float) -> tuple[int, str, str]:
     """Run a command as a process, with a Ctrl-C in the midst of solving."""
     command = [sys.executable, "-m", "factored_polca", *arguments]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -418,15 +418,16 @@ def interrupted(*arguments: str) -> tuple[int, str, str]:
         for line in process.stderr:
             if line.startswith("solving"):
                 break
-        time.sleep(1)
+        time.sleep(after_seconds)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     return process.returncode, out, err
 
 
 def test_ctrl_c_keeps_what_was_found(run_json: Run) -> None:
-    """The hallway takes far longer than a second to any such gap."""
-    status, out, err = interrupted("solve", "hallway", "--gap", "1e-9", "--json", "-o", "h.policy")
+    """The hallway takes far longer than that to any such gap; the first bounds take half a second."""
+    command = ("solve", "hallway", "--gap", "1e-9", "--json", "-o", "h.policy")
+    status, out, err = interrupted(*command, after_seconds=3)
     assert status == 130
     assert "Traceback" not in err
     data = json.loads(out)
@@ -437,7 +438,9 @@ def test_ctrl_c_keeps_what_was_found(run_json: Run) -> None:
 
 def test_ctrl_c_where_there_is_no_result_yet_leaves_nothing(folder: Path) -> None:
     before = sorted(folder.iterdir())
-    status, out, err = interrupted("solve", "taxi", "--horizon", "300000", "-o", "t.policy")
+    status, out, err = interrupted(
+        "solve", "taxi", "--horizon", "300000", "-o", "t.policy", after_seconds=1
+    )
     assert (status, out) == (130, "")
     assert err.strip() == "interrupted"
     assert sorted(folder.iterdir()) == before

@@ -23,6 +23,9 @@ from factored_polca.explicit.arrays import ArrayMDP
 from factored_polca.minimisation.criterion import Choice, DecisionProcess
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import (
+    FloatArray,
+    Int32Array,
+    Int64Array,
     PushPlan,
     RowTable,
     make_plan,
@@ -31,8 +34,8 @@ from factored_polca.minimisation.push import (
     row_table,
     rows_at,
 )
-from factored_polca.models import Fault, ModelError
-from factored_polca.symbolic import RowDiagram
+from factored_polca.models import Fault, LimitReached, ModelError
+from factored_polca.symbolic import RowDiagram, SymbolicModel
 
 LARGEST_REWARD_EXPONENT = 200
 LARGEST_REWARD = 10**LARGEST_REWARD_EXPONENT
@@ -168,26 +171,42 @@ def push_states(
     """The float rows of states [state, feature] over blocks, as a CSR array."""
     symbolic = partition.symbolic
     chosen = rows_at(symbolic, rows, table, plan.slots, states)
-    row_ends = np.zeros(len(states), dtype=np.int64)
-    room = max(1024, 8 * len(states))
-    blocks, masses = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
+    pointers, blocks, masses = push_all(symbolic, plan, table, chosen)
+    shape = (len(states), partition.blocks + partition.has_outside)
+    return sparse.csr_array((masses, blocks, pointers), shape=shape)
+
+
+def push_all(
+    symbolic: SymbolicModel, plan: PushPlan, table: RowTable, chosen: Int32Array, most: int | None = None
+) -> tuple[Int64Array, Int64Array, FloatArray]:
+    """The float masses of the leaves that states reach, whose rows are `chosen` [state, slot].
+
+    Returns:
+        pointers [state], one more at the end; leaves and masses [entry], by state and leaf.
+
+    Raises:
+        LimitReached: more than `most` entries.
+    """
+    row_ends = np.zeros(len(chosen), dtype=np.int64)
+    room = max(1024, 8 * len(chosen))
+    found, masses = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
     state = np.zeros(2, dtype=np.int64)
     while True:
         symbolic.manager.pause()
         code = push_floats(
             plan.roots, plan.slot, plan.first_child, plan.children, plan.leaf,
-            table.start, table.value, table.probability, chosen, row_ends, blocks, masses, state,
+            table.start, table.value, table.probability, chosen, row_ends, found, masses, state,
         )  # fmt: skip
+        if most is not None and state[1] > most:
+            raise LimitReached(f"more than {most:,} entries in the quotient's kernel", "quotient")
         if code == 0:
             break
         if code == 2:
             continue
-        more = max(len(blocks), partition.blocks)
-        blocks = np.concatenate([blocks, np.empty(more, dtype=np.int64)])
+        more = max(len(found), int(plan.leaf.max()) + 1)
+        found = np.concatenate([found, np.empty(more, dtype=np.int64)])
         masses = np.concatenate([masses, np.empty(more, dtype=np.float64)])
-    pointers = np.concatenate([[0], row_ends])
-    shape = (len(states), partition.blocks + partition.has_outside)
-    return sparse.csr_array((masses[: state[1]], blocks[: state[1]], pointers), shape=shape)
+    return np.concatenate([[0], row_ends]), found[: state[1]], masses[: state[1]]
 
 
 def _choice_matrix(

@@ -3,6 +3,9 @@
 `project` carries states and beliefs of the model to blocks; `lift` carries values and policies of
 the quotient back to diagrams over states.  The lifted policy has, on the original model, the value
 that it has on the quotient.
+
+The quotient of a fully observed process is an MDP, that of a partially observed one a POMDP; there a map
+block -> action is what a policy does where it is certain of the block.
 """
 
 from __future__ import annotations
@@ -17,6 +20,11 @@ import numpy.typing as npt
 from factored_polca.diagrams import FLOAT, INDEX, Diagram, at, choose, evaluate_states, relabel
 from factored_polca.minimisation.criterion import DecisionProcess
 from factored_polca.minimisation.partition import Partition
+from factored_polca.minimisation.pomdp_quotient import (
+    MAXIMUM_OBSERVATIONS,
+    PomdpQuotient,
+    make_pomdp_quotient,
+)
 from factored_polca.minimisation.quotient import Quotient, initial_distribution, make_quotient
 from factored_polca.minimisation.refine import Minimisation, Progress, minimise
 from factored_polca.models import Value
@@ -27,7 +35,18 @@ class Reduction:
     """A minimised decision process: the partition, the quotient, and how to get there and back."""
 
     minimisation: Minimisation
-    quotient: Quotient
+    quotient: Quotient | PomdpQuotient
+
+    @property
+    def pomdp_quotient(self) -> PomdpQuotient:
+        """The quotient of a partially observed process.
+
+        Raises:
+            TypeError: the process is fully observed.
+        """
+        if not isinstance(self.quotient, PomdpQuotient):
+            raise TypeError("the process is fully observed; `quotient.mdp` is what it became")
+        return self.quotient
 
     @property
     def process(self) -> DecisionProcess:
@@ -111,9 +130,20 @@ def reduce(
     confirmations: int = 1,
     block_limit: int | None = None,
     progress: Progress | None = None,
+    maximum_observations: int = MAXIMUM_OBSERVATIONS,
 ) -> Reduction:
-    """Minimise a decision process and build its quotient; see `minimise`."""
+    """Minimise a decision process and build its quotient; see `minimise` and `make_pomdp_quotient`.
+
+    Raises:
+        LimitReached: also where a choice of a partially observed process has more than
+            `maximum_observations` joint observations.
+    """
     found = minimise(
         process, seed=seed, confirmations=confirmations, block_limit=block_limit, progress=progress
     )
+    if process.partial:
+        quotient = make_pomdp_quotient(
+            process, found.partition, maximum_observations=maximum_observations, seed=seed
+        )
+        return Reduction(found, quotient)
     return Reduction(found, make_quotient(process, found.partition))

@@ -21,7 +21,7 @@ import numpy as np
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.pomdp_problem import Problem
 
-MERGE: Final = 1e-13
+MERGE: Final = 1e-14
 """Beliefs closer than this in L1 distance count as equal; `merge_widening` bounds what it may cost."""
 
 NODES, ENTRIES, CHOICES, CHILDREN, VECTORS, NUMBERS, LINKS, LOG, BACKUPS, TRIALS = range(10)
@@ -76,7 +76,7 @@ class Tree(NamedTuple):
     other: FloatArray  # [widest class] scratch
     touched: IntArray  # [widest class] scratch
     path: IntArray  # [depth] scratch
-    bins: FloatArray  # [by upper bound, by entropy, (mean, count)]; the last row: least and largest corner
+    bins: FloatArray  # [by upper bound, by entropy, (mean, count)]; last row: corners' range, distance
 
 
 GROWING: Final = {
@@ -90,14 +90,15 @@ FLOATS: Final = {"bound", "entry_weight", "choice", "chance", "number"}
 COLUMNS: Final = {"node": 8, "bound": 3, "choice": 2, "vector": 5, "log": 2}
 
 
-def merge_widening(problem: Problem) -> float:
-    """What counting beliefs within `MERGE` as equal may take off an upper bound.
+def merge_widening(problem: Problem, tree: Tree) -> float:
+    """What counting beliefs as equal may have taken off an upper bound; d is the largest distance so far.
 
     The optimal value changes by at most (V_max - V_min)/2 times the L1 distance; each step may merge
-    once more: gamma * MERGE * (R_max - R_min) / (2 (1 - gamma)^2).
+    once more: gamma d (R_max - R_min) / (2 (1 - gamma)^2).
     """
     least, largest = problem.reward_range
-    return problem.discount * MERGE * (largest - least) / (2 * (1 - problem.discount) ** 2)
+    distance = float(tree.bins[BINS, 1, 0])
+    return problem.discount * distance * (largest - least) / (2 * (1 - problem.discount) ** 2)
 
 
 def new_tree(

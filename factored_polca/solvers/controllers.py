@@ -226,12 +226,15 @@ def _dead_states(problem: Problem) -> BoolArray:
 
 
 def _shown_when_dead(problem: Problem, j: int) -> tuple[IntArray, IntArray]:
-    """The pairs (observation, number of `observed`) with which option j may lead to a dead state."""
+    """The pairs (observation, number of `observed`) with which option j's action may lead to a dead state.
+
+    From the option's class, or from where all has been dead already.
+    """
     dead = _dead_states(problem)
     if not dead.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     bounds, y = problem.arrays.offset, int(problem.option_class[j])
-    states = problem.states[bounds[y] : bounds[y + 1]]
+    states = np.concatenate([problem.states[bounds[y] : bounds[y + 1]], np.flatnonzero(dead)])
     observations, seen = [], []
     for number, matrix in enumerate(problem.original.kernel[int(problem.option_action[j])]):
         mass = np.asarray(matrix[states, :].sum(axis=0)) * dead

@@ -41,7 +41,7 @@ from factored_polca.solvers.pomdp_result import Bounds, Demand, POMDPSolution
 from factored_polca.solvers.qmdp import solve_qmdp
 from factored_polca.solvers.result import Guarantee
 from factored_polca.solvers.sarsop import STYLE, solve_sarsop
-from factored_polca.solvers.tree_search import MEMORY_LIMIT, Search
+from factored_polca.solvers.tree_search import MEMORY_LIMIT, begun, nothing_to_gain
 from factored_polca.solvers.unfolding import solve_by_unfolding
 
 FEW_BELIEFS: Final = 400
@@ -118,12 +118,14 @@ def _check(pomdp: ArrayPOMDP, method: str, horizon: int | None, demand: Demand) 
 
 def _automatic(problem: Problem, demand: Demand, exact: bool, everywhere: bool) -> POMDPSolution:
     """See the module's docstring."""
-    if problem.classes and int(np.diff(problem.arrays.offset).max()) == 1:
+    if problem.classes == 0:
+        return nothing_to_gain(problem, "exact" if exact else "auto")
+    if int(np.diff(problem.arrays.offset).max()) == 1:
         return _all_seen(problem, demand)
     notes: list[str] = []
     if not everywhere:
         found = solve_by_unfolding(problem, replace(demand, progress=None), beliefs=FEW_BELIEFS)
-        if found.converged or found.status in ("interrupted", "rounding limit") or not problem.classes:
+        if found.converged or found.status in ("interrupted", "rounding limit"):
             return replace(found, note=_joined(["few beliefs can be reached", found.note]))
         notes.append(f"more than {FEW_BELIEFS} beliefs can be reached, so unfolding was left")
     small = len(problem.states) <= FEW_STATES
@@ -140,7 +142,7 @@ def _search(
     problem: Problem, demand: Demand, notes: list[str], other: POMDPSolution | None, *, try_graph: bool
 ) -> POMDPSolution:
     """SARSOP, with policy iteration in between where it is tried; `other` is a result to join."""
-    run = Search(problem, demand, STYLE, MEMORY_LIMIT)
+    run = begun(problem, demand, STYLE, MEMORY_LIMIT)
     status = run.run(STALLED if try_graph and demand.iterations is None else None)
     if try_graph and status == "iteration limit" and demand.iterations is None:
         notes.append(f"SARSOP: gap {run.widest_gap:.3g} after {STALLED} trials")

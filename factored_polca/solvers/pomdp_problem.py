@@ -45,7 +45,7 @@ from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray, Spar
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.models.errors import ModelError
 
-PROPORTIONAL: Final = 1e-12
+PROPORTIONAL: Final = 2e-15
 """Matrices are proportional if no entry of one, scaled, is off by more than this share."""
 
 
@@ -84,6 +84,7 @@ class Problem:
     observed_as: tuple[tuple[int, ...], ...]  # [k] the original observations that branch k stands for
     roots: tuple[Root, ...]
     discount: float
+    ends: bool  # whether the process can come to a dead state
     cache: dict[str, object] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -151,14 +152,6 @@ class Problem:
         least, largest = float(rewards.min()), float(rewards.max())
         return (min(least, 0.0), max(largest, 0.0)) if self.ends else (least, largest)
 
-    @cached_property
-    def ends(self) -> bool:
-        """Whether a row misses mass: whether the process can come to a dead state."""
-        sums = [np.zeros(self.size(int(y))) for y in self.option_class]
-        for k, matrix in enumerate(self.matrices):
-            sums[int(self.branch_option[k])] += np.asarray(matrix.sum(axis=1))
-        return any(bool(np.any(total < 1 - 1e-9)) for total in sums)
-
     @property
     def value_span(self) -> float:
         """A bound on the largest |value| of any policy, (1 for a problem without rewards)."""
@@ -218,11 +211,9 @@ def prepare(pomdp: ArrayPOMDP, roots: FloatArray | None = None, *, merge: bool =
     Raises:
         ModelError: a root that is no distribution.
     """
-    beliefs = pomdp.initial[None, :] if roots is None else np.vstack([pomdp.initial, roots])
-    if beliefs.shape[1:] != (pomdp.states,) or np.any(beliefs < 0):
-        raise ModelError("a root belief has the wrong length or a negative entry")
-    if np.any(np.abs(beliefs.sum(axis=1) - 1) > 1e-9):
-        raise ModelError("a root belief does not sum to 1")
+    beliefs = pomdp.initial[None, :]
+    if roots is not None:
+        beliefs = np.vstack([beliefs, _checked_roots(roots, pomdp.states)])
     totals = pomdp.to_mdp().transitions
     dead = _dead_states(pomdp, totals)
     kept = _reached(totals, (beliefs > 0).any(axis=0) & ~dead, dead)
@@ -242,7 +233,20 @@ def prepare(pomdp: ArrayPOMDP, roots: FloatArray | None = None, *, merge: bool =
         observed_as=tuple(builder.observed_as),
         roots=_roots(beliefs, states, offset),
         discount=pomdp.discount,
+        ends=any(bool((matrix[states][:, dead] > 0).nnz) for matrix in totals),
     )
+
+
+def _checked_roots(roots: FloatArray, states: int) -> FloatArray:
+    given = np.asarray(roots)
+    if given.ndim != 2 or given.shape[1] != states or given.dtype.kind not in "fiu":
+        raise ModelError(f"root beliefs are an array of numbers [r, s], s = {states}: a row for each")
+    beliefs = given.astype(np.float64)
+    if not np.all(np.isfinite(beliefs)) or np.any(beliefs < 0):
+        raise ModelError("a root belief has an entry that is negative or not finite: give probabilities")
+    if np.any(np.abs(beliefs.sum(axis=1) - 1) > 1e-9):
+        raise ModelError("a root belief does not sum to 1: divide it by its sum")
+    return beliefs
 
 
 def _dead_states(pomdp: ArrayPOMDP, totals: Sequence[SparseMatrix]) -> BoolArray:

@@ -16,6 +16,7 @@ import numpy as np
 from factored_polca.solvers.belief_tree import (
     BASE,
     BEST,
+    BINS,
     CHILDREN,
     CHOICE_UPPER,
     CHOICES,
@@ -86,6 +87,7 @@ def find_or_add(a: Arrays, t: Tree, y: int, mass: float, count: int) -> int:
             for e in range(start, start + count):
                 distance += abs(t.entry_weight[e] - t.dense[t.entry_state[e]])
             if distance <= MERGE:
+                t.bins[BINS, 1, 0] = max(t.bins[BINS, 1, 0], distance)
                 break
         found = t.node[found, SAME_HASH]
     if found < 0:

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -106,6 +106,7 @@ class Search:
         vectors, options = blind_vectors(problem, self.demand)
         above = delayed_bound(problem, demand=self.demand)
         self.above = above
+        self.stopped = above.status == "interrupted"
         self.least = room(problem)
         self.tree = new_tree(problem, vectors, options, above.corner_values, above.vectors, _depth(self))
         self.roots = np.array([self._node(root.y, root.belief) for root in problem.roots], dtype=np.int64)
@@ -114,12 +115,11 @@ class Search:
             tree_bounds.refresh_upper(self.tree, node)
             tree_bounds.refresh_lower(self.tree, node)
         self.generator = np.random.default_rng(self.demand.seed)
-        self.widening = problem.slack + merge_widening(problem)
         self.next_tidy = int(self.tree.counts[VECTORS]) + 50
         self.next_evaluation = int(self.tree.counts[VECTORS]) + FIRST_EVALUATION
         self.evaluated = 0
         self.slice = 1
-        self.note()
+        self.note(tell=False)
 
     def _node(self, y: int, belief: FloatArray) -> int:
         states = np.flatnonzero(belief)
@@ -155,19 +155,24 @@ class Search:
         return lower
 
     @property
+    def widening(self) -> float:
+        """What rounding and merging may have taken off an upper bound."""
+        return self.problem.slack + merge_widening(self.problem, self.tree)
+
+    @property
     def root_upper(self) -> FloatArray:
         """[root], rounding and merging added."""
         upper: FloatArray = self.tree.bound[self.roots, UPPER] + self.widening
         return np.maximum(upper, self.root_lower)
 
-    def note(self) -> None:
+    def note(self, *, tell: bool = True) -> None:
         """Write the bounds at b0 into the history, and tell who waits for them."""
         lower, upper = self.problem.combine(self.root_lower), self.problem.combine(self.root_upper)
         if self.history:
             lower, upper = max(lower, self.history[-1].lower), min(upper, self.history[-1].upper)
         if not self.history or (lower, upper) != (self.history[-1].lower, self.history[-1].upper):
             self.history.append(Bounds(time.perf_counter() - self.began, lower, upper))
-        if self.demand.progress is not None:
+        if tell and self.demand.progress is not None:
             self.demand.progress(lower, upper)
 
     # -- the loop ------------------------------------------------------------------------------
@@ -178,7 +183,8 @@ class Search:
         May be called again to go on.
         """
         limit = self.demand.iterations if trials is None else trials
-        if self.above.status == "interrupted":  # Ctrl-C came while the starting bound was computed
+        if self.stopped:  # Ctrl-C came while the starting bound was computed
+            self.stopped = False
             return "interrupted"
         try:
             while True:
@@ -285,7 +291,7 @@ class Search:
         for node in self.roots.tolist():
             tree_bounds.refresh_lower(self.tree, node)
             tree_bounds.refresh_upper(self.tree, node)
-        self.note()
+        self.note(tell=False)
         last, policy = self.history[-1], self._policy()
         widest = self.widest_gap
         text = f"the optimum at the start lies in [lower, upper], {last.upper - last.lower:.3g} wide, "
@@ -370,16 +376,26 @@ def run_search(
     if not demand.gap > 0:
         raise ModelError(f"the gap is {demand.gap}: it must be positive; 1e-6 is a common choice")
     if problem.classes == 0:
-        return _nothing(problem, style)
-    run = Search(problem, demand, style, memory_limit)
+        return nothing_to_gain(problem, style.name)
+    run = begun(problem, demand, style, memory_limit)
     return run.solution(run.run())
 
 
-def _nothing(problem: Problem, style: Style) -> POMDPSolution:
+def begun(problem: Problem, demand: Demand, style: Style, memory_limit: int) -> Search:
+    """A search with its starting bounds; after Ctrl-C they are computed once more, then it ends at once."""
+    try:
+        return Search(problem, demand, style, memory_limit)
+    except KeyboardInterrupt:
+        run = Search(problem, replace(demand, progress=None), style, memory_limit)
+        run.stopped = True
+        return run
+
+
+def nothing_to_gain(problem: Problem, method: str) -> POMDPSolution:
     """The solution where no belief is worth anything but 0."""
     none = np.zeros(len(problem.roots))
     return POMDPSolution(
         0.0, 0.0, 0.0, problem.policy([], [], "exact"), none, none, "converged",
-        Guarantee("exact", "every state is worth 0 under every policy"), style.name, 0, 0, 0.0,
+        Guarantee("exact", "every state is worth 0 under every policy"), method, 0, 0, 0.0,
         (Bounds(0.0, 0.0, 0.0),),
     )  # fmt: skip
