@@ -20,8 +20,18 @@ Each machine that is up brings 1 in each step, the server 2.  Actions other than
 the one channel, `answer`, reports none (the generator lets it report a constant, which is the same).
 
 `topology`: in a `cycle` machine i depends on i - 1 and the server on the last one; in `legs` (n = 3m + 1)
-three chains of m machines hang on the server, which depends on none and stays up with 0.9.  There is no
-hierarchy.
+three chains of m machines hang on the server, which depends on none and stays up with 0.9.
+
+`segment` s > 0: a hierarchy, ours.  Along the cycle, or along each leg, s machines after the other are a
+segment, the last one what is left; the server of the legs is one of its own.
+
+    Administer = {Segment_0, Segment_1, ...}      Segment_k = {noop, reboot_i, ping_i for its machines i}
+
+A segment's own reward counts its machines and the costs of its actions alone.  In legs it needs to know its
+leg up to its last machine, and the server: 2^(m+1) blocks for the last or only segment of a leg, whatever
+the other legs.  In a cycle the machine that the first one depends on depends on all others: an exact
+abstraction finds nothing to ignore, and only the policies of the segments are simpler.  Without `segment`
+there is one task over all actions.
 """
 
 from __future__ import annotations
@@ -39,6 +49,7 @@ from factored_polca.models import (
     Model,
     ModelError,
     Observation,
+    Task,
     TaskHierarchy,
     boolean,
     conditional,
@@ -48,6 +59,7 @@ from factored_polca.models import (
 
 Size = Annotated[int, "number n of machines; 2^n states, 2n + 1 actions"]
 Topology = Annotated[str, "who depends on whom: cycle or legs (for n = 4, 7, 10, ...)"]
+Segment = Annotated[int, "machines s of a segment, each with a task of its own; 0: one task for all"]
 Discount = Annotated[Number, "discount, from 0 to 1"]
 
 _TOPOLOGIES = ("cycle", "legs")
@@ -60,13 +72,19 @@ _REBOOT_COST = Fraction("2.5")
 _PING_COST = Fraction("0.1")
 
 
-def model(*, size: Size = 4, topology: Topology = "cycle", discount: Discount = Fraction(95, 100)) -> Model:
+def model(
+    *,
+    size: Size = 4,
+    topology: Topology = "cycle",
+    segment: Segment = 0,
+    discount: Discount = Fraction(95, 100),
+) -> Model:
     """The POMDP of `size` machines; all are up at the start.
 
     Raises:
         ModelError: a parameter out of its range.
     """
-    n = integer("size", size, 1, 128)
+    n = _size(size, segment)
     upstream = _upstream(n, choice("topology", topology, _TOPOLOGIES))
     ups = [boolean(f"up_{i}") for i in range(n)]
     answer = Observation("answer", ["none", "up", "down"])
@@ -83,7 +101,7 @@ def model(*, size: Size = 4, topology: Topology = "cycle", discount: Discount = 
         "network",
         ups,
         [Action("noop", drift), *reboots, *pings],
-        rewards=[conditional(up, 2 if i == 0 else 1, 0) for i, up in enumerate(ups)],
+        rewards=[_worth(i, up) for i, up in enumerate(ups)],
         initial=dict.fromkeys(ups, TRUE),
         discount=discount_factor(discount),
         observability="partial",
@@ -122,12 +140,53 @@ def _answer(up: Feature) -> Expression:
     )
 
 
+def _worth(i: int, up: Feature) -> Expression:
+    return conditional(up, 2 if i == 0 else 1, 0)
+
+
+def _size(size: int, segment: int) -> int:
+    n = integer("size", size, 1, 128)
+    integer("segment", segment, 0, n)
+    return n
+
+
+def _segments(upstream: list[int | None], length: int) -> list[list[int]]:
+    """The machines of each segment of `length` machines along a chain."""
+    n = len(upstream)
+    chains = [range(n)]
+    if None in upstream:
+        leg = max(1, n // 3)
+        chains = [range(1), *(range(i, i + leg) for i in range(1, n, leg))]
+    return [list(chain[i : i + length]) for chain in chains for i in range(0, len(chain), length)]
+
+
 def tasks(
-    *, size: Size = 4, topology: Topology = "cycle", discount: Discount = Fraction(95, 100)
+    *,
+    size: Size = 4,
+    topology: Topology = "cycle",
+    segment: Segment = 0,
+    discount: Discount = Fraction(95, 100),
 ) -> TaskHierarchy:
-    """One task over all actions.
+    """One task over all actions, or Administer{Segment_0, ...} with a task for each segment.
 
     Raises:
         ModelError: a parameter out of its range.
     """
-    return flat_task(model(size=size, topology=topology, discount=discount))
+    whole = model(size=size, topology=topology, segment=segment, discount=discount)
+    if segment == 0:
+        return flat_task(whole)
+    found = []
+    for k, machines in enumerate(_segments(_upstream(size, topology), segment)):
+        costs = {
+            **{f"reboot_{i}": -_REBOOT_COST for i in machines},
+            **{f"ping_{i}": -_PING_COST for i in machines},
+        }
+        found.append(
+            Task(
+                f"Segment_{k}",
+                ["noop", *costs],
+                pseudo_rewards=[_worth(i, whole.features[i]) for i in machines],
+                pseudo_rewards_of=costs,
+            )
+        )
+    return TaskHierarchy([Task("Administer", [task.name for task in found]), *found])

@@ -42,13 +42,18 @@ STATES = [
     ("taxi", {"anywhere": "true", "noise_bits": "3"}, 25 * 27 * 4 * 8),
     ("workshop", {}, 4**8 * 60),
     ("workshop", {"size": "1", "decay": "0"}, 4 * 60),
-    # Partially observable: see test_pomdp_domains.py.
+    # Partially observable: see test_pomdp_domains.py and test_hierarchical_pomdp_domains.py.
     ("cheese", {}, 11),
+    ("cheese_taxi", {}, 33),
     ("coffee", {}, 432),
     ("hallway", {}, 60),
+    ("meds", {}, 3),
     ("network", {}, 2**4),
+    ("nursebot", {}, 576),
+    ("part_painting", {}, 4),
     ("rocksample", {}, 4 * 5 * 2**4),
     ("tiger", {}, 2),
+    ("twenty_questions", {}, 12),
 ]
 
 
@@ -512,6 +517,10 @@ def test_big_domains_stay_factored(
 # --------------------------------------------------------------------------------------------
 
 
+UNSIZED = ("toy", "cheese", "cheese_taxi", "coffee", "meds", "nursebot", "part_painting", "tiger",
+           "twenty_questions")  # fmt: skip
+
+
 def test_describe_gives_each_parameter_with_default_type_and_meaning() -> None:
     for name in library.domains():
         description = library.describe(name)
@@ -521,7 +530,7 @@ def test_describe_gives_each_parameter_with_default_type_and_meaning() -> None:
             assert parameter.documentation, (name, parameter.name)
         names = [parameter.name for parameter in description.parameters]
         assert "discount" in names
-        assert names[0] == "size" or name in ("toy", "cheese", "coffee", "tiger")
+        assert names[0] == "size" or name in UNSIZED
     size, slip = library.describe("taxi").parameters[:2]
     assert (size.name, size.default, size.kind) == ("size", 5, "integer")
     assert (slip.default, slip.kind) == (False, "true or false or text")
