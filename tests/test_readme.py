@@ -25,7 +25,7 @@ def blocks(language: str) -> list[str]:
 def comparable(text: str) -> list[str]:
     text = re.sub(r"\b\d+(\.\d+)? (ms|s)\b", "TIME", text)
     text = re.sub(r"\b\d+(\.\d+)?e-\d+\b", "TINY", text)
-    text = re.sub(r"\b\d+ MiB\b", "SIZE", text)
+    text = re.sub(r"\b\d[\d,]* MiB\b", "SIZE", text)
     lines = [re.sub(r"─+", "─", re.sub(r"\s+", " ", line)).strip() for line in text.splitlines()]
     return [line for line in lines if line]
 

@@ -26,6 +26,7 @@ MERGE: Final = 1e-14
 
 NODES, ENTRIES, CHOICES, CHILDREN, VECTORS, NUMBERS, LINKS, LOG, BACKUPS, TRIALS = range(10)
 """What `Tree.counts` counts."""
+COUNTS: Final = 10
 
 
 CLASS, START, COUNT, BEST, VECTOR_MARK, LOG_MARK, FIRST_CHOICE, SAME_HASH = range(8)
@@ -126,7 +127,7 @@ def new_tree(
     bins[BINS, 0] = corner.min(initial=0.0), corner.max(initial=0.0)
     tree = Tree(
         **fields,  # type: ignore[arg-type]
-        counts=np.zeros(10, dtype=np.int64),
+        counts=np.zeros(COUNTS, dtype=np.int64),
         head=np.full((problem.classes, 3), -1, dtype=np.int64),
         corner=corner.astype(np.float64),
         option_bound=option_bound.astype(np.float64),
@@ -166,6 +167,20 @@ def room(problem: Problem) -> IntArray:
     return np.array(
         [nodes, nodes * widest, options, branches, 1, widest, branches, 2, 0, 0], dtype=np.int64
     )
+
+
+def for_vectors(least: IntArray) -> IntArray:
+    """What backups alone take: `least` without nodes, entries, choices, children and updates of points."""
+    needed = np.zeros_like(least)
+    needed[[VECTORS, NUMBERS, LINKS]] = least[[VECTORS, NUMBERS, LINKS]]
+    return needed
+
+
+def for_points(points: int) -> IntArray:
+    """What `points` updates of points take."""
+    needed = np.zeros(COUNTS, dtype=np.int64)
+    needed[LOG] = points
+    return needed
 
 
 def grown(tree: Tree, least: IntArray) -> Tree:

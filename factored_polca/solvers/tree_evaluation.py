@@ -29,6 +29,7 @@ from factored_polca.solvers.belief_tree import (
     START,
     VECTORS,
     Tree,
+    for_vectors,
     grown,
 )
 from factored_polca.solvers.controllers import Controllers
@@ -93,7 +94,7 @@ class Evaluator:
 def with_controllers(tree: Tree, least: IntArray, controllers: Controllers, vectors: FloatArray) -> Tree:
     """`tree` with the vectors [x] of `controllers`, which must be complete, appended."""
     problem, count = controllers.problem, controllers.count
-    tree = grown(tree, least * count)
+    tree = grown(tree, for_vectors(least) * count)
     base, at, link = (int(tree.counts[name]) for name in (VECTORS, NUMBERS, LINKS))
     tree.number[at : at + len(vectors)] = vectors
     first_branch = problem.arrays.first_branch

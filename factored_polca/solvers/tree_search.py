@@ -50,6 +50,8 @@ from factored_polca.solvers.belief_tree import (
     TRIALS,
     UPPER,
     VECTORS,
+    for_points,
+    for_vectors,
     grown,
     merge_widening,
     new_tree,
@@ -63,7 +65,7 @@ from factored_polca.solvers.pomdp_problem import Problem
 from factored_polca.solvers.pomdp_result import Bounds, Demand, POMDPSolution
 from factored_polca.solvers.result import Guarantee, Status
 from factored_polca.solvers.tree_evaluation import NARROW, Evaluator, with_controllers
-from factored_polca.solvers.trials import ALL_CLOSE, NO_ROOM, TO_TIDY, search
+from factored_polca.solvers.trials import ALL_CLOSE, NO_ROOM, TO_TIDY, TRIAL_STATE, search
 
 MEMORY_LIMIT: Final = 6 << 30
 """Bytes that the tree may take unless a caller says otherwise."""
@@ -119,6 +121,7 @@ class Search:
         self.next_evaluation = int(self.tree.counts[VECTORS]) + FIRST_EVALUATION
         self.evaluated = 0
         self.slice = 1
+        self.trial = np.zeros(TRIAL_STATE)
         self.note(tell=False)
 
     def _node(self, y: int, belief: FloatArray) -> int:
@@ -218,11 +221,10 @@ class Search:
         if limit is not None:
             target = min(target, limit)
         while int(self.tree.counts[TRIALS]) < target:
-            started = time.perf_counter()
+            started, trials = time.perf_counter(), target - int(self.tree.counts[TRIALS])
             code = search(
-                problem.arrays, self.tree, self.roots, problem.discount, self.goal, style.share,
-                style.fine, style.sarsop, min(self.slice, target - int(self.tree.counts[TRIALS])),
-                self.next_tidy, self.least,
+                problem.arrays, self.tree, self.trial, self.roots, problem.discount, self.goal,
+                style.share, style.fine, style.sarsop, min(self.slice, trials), self.next_tidy, self.least,
             )  # fmt: skip
             elapsed = time.perf_counter() - started
             self.slice = self.slice * 2 if elapsed < 0.05 else max(1, self.slice // 2)
@@ -254,7 +256,7 @@ class Search:
             self.generator.shuffle(opened)
             before = tree.bound[:, LOWER].copy()
             for part in np.array_split(opened, max(1, len(opened) // 200)):
-                tree = self.tree = grown(self.tree, self.least * len(part))
+                tree = self.tree = grown(self.tree, for_vectors(self.least) * len(part))
                 tree_bounds.raise_lower(
                     problem.arrays, tree, part, before, problem.discount, gain, self.least
                 )
@@ -281,7 +283,7 @@ class Search:
         if evaluate:
             self.evaluated = done
         threshold = 1e-3 * self.demand.gap
-        self.tree = grown(self.tree, self.least * max(1, int(self.tree.counts[NODES]) // 4))
+        self.tree = grown(self.tree, for_points(int(self.tree.counts[NODES])))
         tree_bounds.sweep(self.problem.arrays, self.tree, self.problem.discount, threshold, evaluate)
 
     # -- the result ----------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from factored_polca.explicit.arrays import IntArray
+from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.belief_tree import (
     BASE,
     BINS,
@@ -42,6 +42,13 @@ from factored_polca.solvers.tree_bounds import (
     refresh_upper,
     settle,
 )
+
+PHASE, DEPTH, NODE, EPSILON, ALLOWED, LOWER_TARGET, UPPER_TARGET = range(7)
+"""A trial's own state, which outlasts a call so that one which ran out of room goes on where it was: what
+comes next, the length of `Tree.path`, the node to go on from, the trial's width, the width allowed at the
+node, SARSOP's targets."""
+TRIAL_STATE: Final = 7
+AT_REST, DOWN, BACK = range(3)
 
 LEARNING: Final = 0.1
 """How much the newest lower bound counts in the mean of its bin, at least."""
@@ -93,16 +100,18 @@ def known_lower(a: Arrays, t: Tree, j: int, c: int, discount: float) -> float:
 
 
 @kernel
-def way_back(a: Arrays, t: Tree, depth: int, discount: float, threshold: float, least: IntArray) -> bool:
-    """Back up the nodes of `t.path` from `depth` up to the root; False: it ended for want of room."""
-    whole = True
-    while depth >= 0 and has_room(t, least):
-        n = t.path[depth]
-        whole = settle(a, t, n, discount, threshold, least) >= 0 and whole
+def way_back(a: Arrays, t: Tree, trial: FloatArray, discount: float, fine: float, least: IntArray) -> bool:
+    """Back up the nodes of `t.path` from the trial's depth up to the root; False: more room is needed."""
+    threshold = trial[EPSILON] * fine
+    while trial[DEPTH] > 0:
+        n = t.path[int(trial[DEPTH]) - 1]
+        if not has_room(t, least) or settle(a, t, n, discount, threshold, least) < 0:
+            return False
         back_up(a, t, n, discount, threshold * 1e-3)
-        depth -= 1
+        trial[DEPTH] -= 1
+    trial[PHASE] = AT_REST
     t.counts[TRIALS] += 1
-    return whole and depth < 0
+    return True
 
 
 @kernel
@@ -140,44 +149,39 @@ def passed_on(
 
 @kernel
 def descend(
-    a: Arrays,
-    t: Tree,
-    root: int,
-    discount: float,
-    epsilon: float,
-    threshold: float,
-    sarsop: bool,
-    least: IntArray,
-) -> int:
-    """The way down of one trial into `t.path`; its length, negative where it ended for want of room."""
-    depth, n, allowed = 0, root, epsilon
-    lower_target, upper_target = t.bound[root, LOWER], t.bound[root, LOWER] + epsilon
-    while has_room(t, least):
+    a: Arrays, t: Tree, trial: FloatArray, discount: float, fine: float, sarsop: bool, least: IntArray
+) -> bool:
+    """The way down of a trial into `t.path`; False: more room is needed, then it goes on from there."""
+    threshold = trial[EPSILON] * fine
+    while True:
+        n = int(trial[NODE])
+        if not has_room(t, least):
+            return False
         j = settle(a, t, n, discount, threshold, least)
         if j < 0:
-            break
-        t.path[depth] = n
-        depth += 1
-        if discount == 0.0 or depth == len(t.path):
-            return depth
+            return False
+        t.path[int(trial[DEPTH])] = n
+        trial[DEPTH] += 1
+        if discount == 0.0 or int(trial[DEPTH]) == len(t.path):
+            return True
         c = t.node[n, FIRST_CHOICE] + j - a.first_option[t.node[n, CLASS]]
         if sarsop:
             refresh_lower(t, n)
             expected = predicted(a, t, n)
-            narrow = t.bound[n, UPPER] <= max(upper_target, t.bound[n, LOWER] + allowed)
-            if narrow and depth > 1 and expected <= lower_target:
-                return depth
-        place = excess_branch(a, t, j, c, allowed / discount, sarsop)
+            narrow = t.bound[n, UPPER] <= max(trial[UPPER_TARGET], t.bound[n, LOWER] + trial[ALLOWED])
+            if narrow and trial[DEPTH] > 1 and expected <= trial[LOWER_TARGET]:
+                return True
+        place = excess_branch(a, t, j, c, trial[ALLOWED] / discount, sarsop)
         if place < 0:
-            return depth
+            return True
         if sarsop:
             worth = max(t.bound[n, LOWER], known_lower(a, t, j, c, discount))
-            lower_target, upper_target = max(lower_target, worth), max(upper_target, worth + allowed)
-            lower_target = passed_on(a, t, j, c, place, lower_target, discount, LOWER)
-            upper_target = passed_on(a, t, j, c, place, upper_target, discount, UPPER)
-        allowed /= discount
-        n = t.child[place]
-    return -depth - 1
+            lower_target = max(trial[LOWER_TARGET], worth)
+            upper_target = max(trial[UPPER_TARGET], worth + trial[ALLOWED])
+            trial[LOWER_TARGET] = passed_on(a, t, j, c, place, lower_target, discount, LOWER)
+            trial[UPPER_TARGET] = passed_on(a, t, j, c, place, upper_target, discount, UPPER)
+        trial[ALLOWED] /= discount
+        trial[NODE] = t.child[place]
 
 
 ALL_CLOSE, USED_UP, NO_ROOM, TO_TIDY = range(4)
@@ -187,6 +191,7 @@ ALL_CLOSE, USED_UP, NO_ROOM, TO_TIDY = range(4)
 def search(
     a: Arrays,
     t: Tree,
+    trial: FloatArray,
     roots: IntArray,
     discount: float,
     gap: float,
@@ -200,24 +205,27 @@ def search(
     """Up to `trials` trials, each at the root with the widest gap, a trial's width `share` of it.
 
     Ends with ALL_CLOSE: all gaps are at most `gap`; USED_UP: that was the last; NO_ROOM: arrays are
-    full; TO_TIDY: there are `tidy_at` vectors.
+    full, the trial under way goes on with the next call; TO_TIDY: there are `tidy_at` vectors.
     """
     for _ in range(trials):
-        widest, root = -1.0, -1
-        for n in roots:
-            refresh_lower(t, n)
-            refresh_upper(t, n)
-            if t.bound[n, UPPER] - t.bound[n, LOWER] > widest:
-                widest, root = t.bound[n, UPPER] - t.bound[n, LOWER], n
-        if widest <= gap:
-            return ALL_CLOSE
-        epsilon = max(gap, share * widest)
-        depth = descend(a, t, root, discount, epsilon, epsilon * fine, sarsop, least)
-        whole = depth >= 0
-        if not whole:
-            depth = -depth - 1
-        whole = way_back(a, t, depth - 1, discount, epsilon * fine, least) and whole
-        if not whole:
+        if trial[PHASE] == AT_REST:
+            widest, root = -1.0, -1
+            for n in roots:
+                refresh_lower(t, n)
+                refresh_upper(t, n)
+                if t.bound[n, UPPER] - t.bound[n, LOWER] > widest:
+                    widest, root = t.bound[n, UPPER] - t.bound[n, LOWER], n
+            if widest <= gap:
+                return ALL_CLOSE
+            epsilon = max(gap, share * widest)
+            trial[PHASE], trial[DEPTH], trial[NODE] = DOWN, 0.0, root
+            trial[EPSILON], trial[ALLOWED] = epsilon, epsilon
+            trial[LOWER_TARGET], trial[UPPER_TARGET] = t.bound[root, LOWER], t.bound[root, LOWER] + epsilon
+        if trial[PHASE] == DOWN:
+            if not descend(a, t, trial, discount, fine, sarsop, least):
+                return NO_ROOM
+            trial[PHASE] = BACK
+        if not way_back(a, t, trial, discount, fine, least):
             return NO_ROOM
         if t.counts[VECTORS] >= tidy_at:
             return TO_TIDY
