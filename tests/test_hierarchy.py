@@ -18,7 +18,14 @@ from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.exact_dynamic_programming import evaluate_policy, optimal_solution
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.subtask import subtask_mdp
-from factored_polca.hierarchy import HierarchicalPlan, Options, plan, planning_order, total_counts
+from factored_polca.hierarchy import (
+    HierarchicalPlan,
+    Options,
+    plan,
+    plan_mdp,
+    planning_order,
+    total_counts,
+)
 from factored_polca.models import Action, Feature, Model, ModelError, Task, TaskHierarchy
 
 TIE = 1e-9
@@ -329,9 +336,12 @@ def test_a_start_that_cannot_avoid_a_dead_end_is_an_error() -> None:
         plan(trap("{0: 0.5, 1: 0.5}"))
 
 
-def test_a_partially_observed_model_is_refused_for_now() -> None:
+def test_polca_takes_a_partially_observed_model_only_where_told_to_suppose_it_seen() -> None:
+    model = corridor(observability="partial")
     with pytest.raises(ModelError, match="partially observed"):
-        plan(corridor(observability="partial"))
+        plan_mdp(model)
+    seen = plan_mdp(model, options=Options(assume_observed=True))
+    assert seen.polled.value == plan_mdp(corridor()).polled.value
 
 
 def test_an_unknown_solver_is_refused_with_a_list() -> None:

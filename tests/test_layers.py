@@ -35,7 +35,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "hierarchy": HIERARCHY,  # plan files hold the model in the native format
     "control": CONTROL,
     "simulation": {"control", "hierarchy", "explicit", *SYMBOLIC},  # what it runs is a hierarchy's plan
-    "cli": {"simulation", "control", "library", "", *HIERARCHY},  # from the top package: the version
+    "studies": {"simulation", "control", "library", *HIERARCHY},
+    # from the top package: the version
+    "cli": {"studies", "simulation", "control", "library", "", *HIERARCHY},
     "__main__": {"cli"},
 }
 

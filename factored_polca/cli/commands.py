@@ -1,9 +1,8 @@
-"""The commands that plan and execute: minimise, plan, act, simulate."""
+"""The commands that minimise and execute: minimise, act, simulate."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import resource
 import sys
@@ -39,14 +38,22 @@ def current_memory_bytes() -> int:
         return peak_memory_bytes()
 
 
-def compile_kernels(output: Output) -> float:
-    """Compile or load the numeric kernels; say so where it takes long."""
+def compile_kernels(output: Output, pomdp_method: str | None = None) -> float:
+    """Compile or load the numeric kernels, those of a POMDP solver too; say so where it takes long."""
     from factored_polca.hierarchy.warm import is_compiled, warm_up
 
+    def work() -> float:
+        seconds = warm_up()
+        if pomdp_method is not None:
+            from factored_polca.solvers import warm_pomdp
+
+            seconds += warm_pomdp.warm_up(pomdp_method)
+        return seconds
+
     if is_compiled():
-        return warm_up()
+        return work()
     with output.progress("compiling numeric kernels, once for this installation (10 to 20 seconds)"):
-        return warm_up()
+        return work()
 
 
 def limits(arguments: argparse.Namespace) -> tuple[int | None, float | None]:
@@ -177,93 +184,6 @@ def refuse_unwritable(path: str) -> None:
     folder = destination(path).parent
     if not os.access(folder, os.W_OK):
         raise UsageError(f"{path}: the folder {folder} can't be written to")
-
-
-def plan(arguments: argparse.Namespace, output: Output) -> int:
-    """Plan a hierarchy, print the table, write the plan."""
-    from factored_polca.hierarchy.executable import executable
-    from factored_polca.hierarchy.plan import Options
-    from factored_polca.hierarchy.plan import plan as plan_model
-    from factored_polca.hierarchy.plan_file import save_plan
-    from factored_polca.hierarchy.report import plan_report
-
-    if arguments.output is not None:
-        refuse_unwritable(arguments.output)
-    source = load(arguments.model, arguments.set, arguments.tasks)
-    report_warnings(source, output)
-    compile_seconds = compile_kernels(output)
-    if source.tasks is None:
-        output.note(f"{source.name} has no tasks: planning one flat task with all actions")
-    memory, deadline = limits(arguments)
-    options = Options(
-        seed=arguments.seed,
-        order=arguments.order,
-        reachable=arguments.reachable,
-        memory_limit=memory,
-        deadline=deadline,
-        flat_block_limit=None if arguments.no_flat else arguments.flat_blocks,
-        solver=arguments.solver,
-    )
-
-    def progress(task: str, stage: str, number: int, blocks: int) -> None:
-        detail = f": round {number}, {blocks:,} blocks" if blocks else ""
-        output.update(f"{task}: {stage}{detail}")
-
-    with source.located(), output.progress(f"planning {source.name}"):
-        found = plan_model(source.model, source.tasks, options, progress=progress)
-    data = plan_report(found)
-    data |= {
-        "parse_seconds": source.parse_seconds,
-        "compile_seconds": compile_seconds,
-        "total_seconds": time.perf_counter() - arguments.began,
-        "peak_memory_bytes": peak_memory_bytes(),
-    }
-    for warning in found.warnings:
-        output.warn(warning)
-    if arguments.output is not None:
-        from factored_polca.cli.output import finite
-
-        save_plan(executable(found, finite(data)), arguments.output)
-    if arguments.json:
-        output.result(data)
-    else:
-        print_plan(data, output)
-        if arguments.output is not None:
-            output.note(
-                f"plan written to {arguments.output}; try: factored-polca simulate {arguments.output}"
-            )
-    return 0
-
-
-def print_plan(data: dict[str, Any], output: Output) -> None:
-    """The figures of `plan` for people."""
-    columns = {
-        "task": "left", "actions": "right", "blocks": "right", "Q-values": "right", "classes": "right",
-        "shared": "right", "value": "right", "time": "right",
-    }  # fmt: skip
-    table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
-    for row in data["tasks"]:
-        value = "none" if row["value"] == -math.inf else f"{row['value']:.6g}"
-        table.add_row(
-            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}", f"{row['q_values']:,}",
-            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", value, seconds(row["seconds"]),
-        )  # fmt: skip
-    table.add_section()
-    total = data["totals"]
-    table.add_row(
-        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", f"{total['q_values']:,}",
-        f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
-    )  # fmt: skip
-    output.table(table)
-    output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
-    output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
-    if data["flat_value"] is None:
-        output.line(f"flat optimum: {escape(data['flat_note'])}")
-    else:
-        cost = data["flat_value"] - data["value"]
-        said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
-        output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
-    output.line(f"guarantee: {escape(data['guarantee'])}")
 
 
 def act(arguments: argparse.Namespace, output: Output) -> int:

@@ -90,19 +90,36 @@ def parser() -> argparse.ArgumentParser:
     with_limits(sub)
     sub.add_argument("--actions", metavar="A,B,...", help="only these actions count")
     sub.add_argument("--certify", action="store_true", help="check the partition without fingerprints")
-    sub = command("plan", "Plan a task hierarchy with PolCA.")
+    sub = command("plan", "Plan a task hierarchy: PolCA, or PolCA+ where the state is not seen.")
     with_model(sub)
     with_limits(sub)
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
     sub.add_argument(
-        "--solver", default="auto", choices=("auto", "vi", "pi", "mpi"), help="for tasks that name none"
-    )
+        "--solver", default="auto", choices=FLAT_SOLVERS, metavar="NAME",
+        help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has",
+    )  # fmt: skip
     sub.add_argument("--no-flat", action="store_true", help="leave out the flat optimum")
     sub.add_argument(
         "--flat-blocks", type=natural, default=100_000, metavar="N",
         help="leave out the flat optimum beyond N blocks (100000)",
     )  # fmt: skip
+    group = sub.add_argument_group("where the state is not seen")
+    group.add_argument(
+        "--gap", type=gap, metavar="G",
+        help="solve tasks to upper - lower <= G (a thousandth of the span of their rewards)",
+    )  # fmt: skip
+    group.add_argument(
+        "--trials",
+        type=counting,
+        default=TRIALS,
+        metavar="N",
+        help=f"no more than N trials a task ({TRIALS})",
+    )
+    group.add_argument(
+        "--episodes", type=counting, default=1000, metavar="N", help="episodes that measure it (1000)"
+    )
+    group.add_argument("--polca", action="store_true", help="plan as if the state were seen: PolCA")
     sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
     with_model(sub)
     add_solving(sub)
@@ -141,8 +158,8 @@ def add_solving(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-o", "--output", metavar="POLICY", help="write the policy to a file")
 
 
+TRIALS = 100
 ORDERS = ("auto", "file", "force", "spectral")
-SOLVERS = ("auto", "vi", "pi", "mpi")
 FLAT_SOLVERS = (
     "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",
     "pi", "mpi",
@@ -218,11 +235,11 @@ def discount(text: str) -> Fraction:
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
     from factored_polca.cli import commands as work
-    from factored_polca.cli import models, solve
+    from factored_polca.cli import models, plan, solve
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
-        "convert": models.convert, "minimise": work.minimise, "plan": work.plan, "act": work.act,
+        "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": work.act,
         "simulate": work.simulate, "solve": solve.solve,
     }  # fmt: skip
 

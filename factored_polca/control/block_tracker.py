@@ -22,6 +22,7 @@ from typing import ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from factored_polca.control.block_walk import Walk, make_walk
 from factored_polca.control.received import Received
@@ -38,6 +39,7 @@ from factored_polca.control.tracker import (
 )
 from factored_polca.diagrams import Diagram, evaluate_states, pairs
 from factored_polca.diagrams.operations import leaf_payloads
+from factored_polca.explicit.arrays import SparseMatrix
 from factored_polca.minimisation import DecisionProcess, Partition, flat_process, minimise
 from factored_polca.models import ModelError, Value
 from factored_polca.symbolic import SymbolicModel, Term
@@ -129,7 +131,7 @@ class BlockTracker(Tracker):
         self.feature_labels = [self.labels(feature_diagram(symbolic, i)) for i in range(count)]
 
     def begin(self, initial: Rows, received: Received, *, narrow: bool = False) -> BlockBelief:
-        masses = self._begun if initial is self.symbolic.initial else self._spread(initial)
+        masses = self.begun if initial is self.symbolic.initial else self._spread(initial)
         count = self.partition.blocks
         if not narrow and masses[count:].sum() > 0:
             raise ModelError(
@@ -145,7 +147,7 @@ class BlockTracker(Tracker):
         return summed(reached, masses, self.partition.blocks)
 
     @cached_property
-    def _begun(self) -> FloatArray:
+    def begun(self) -> FloatArray:
         return self._spread(self.symbolic.initial)
 
     def narrowed(self, blocks: IntArray, masses: FloatArray, received: Received) -> BlockBelief:
@@ -264,6 +266,14 @@ class KernelRows:
             total = total + self._mixed(blocks[low : low + step], weights[low : low + step])
         reached = np.flatnonzero(total)
         return reached, total[reached]
+
+    def matrix(self) -> SparseMatrix:
+        """All rows as a CSR array [block, next block]."""
+        missing = np.flatnonzero(self._place < 0)
+        if len(missing):
+            self._extend(missing)
+        shape = (len(self._start) - 1, self._count)
+        return csr_array((self._masses, self._blocks, self._start), shape=shape)[self._place]
 
     def _mixed(self, blocks: IntArray, weights: FloatArray) -> FloatArray:
         """The mass of each next block [block]."""

@@ -72,11 +72,15 @@ def write_archive(
 class Archive:
     """An archive that is open for reading; its methods raise ValueError or KeyError on damage."""
 
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
+    def __init__(self, archive: zipfile.ZipFile, prefix: str = "") -> None:
+        self._archive, self._prefix = archive, prefix
         entries = archive.infolist()
         if len(entries) > MAXIMUM_ENTRIES or sum(entry.file_size for entry in entries) > MAXIMUM_BYTES:
             raise ValueError("larger than such a file may be")
+
+    def within(self, prefix: str) -> Archive:
+        """The same archive, the names of its arrays without `prefix`."""
+        return Archive(self._archive, prefix)
 
     def text(self, name: str) -> str:
         """The text of an entry."""
@@ -93,7 +97,7 @@ class Archive:
 
     def array(self, name: str, kind: str, dimensions: int = 1) -> npt.NDArray[Any]:
         """The array NAME.npy of one of the `KINDS`: int64 or float64, every number finite."""
-        data = self._archive.read(f"{name}.npy")
+        data = self._archive.read(f"{self._prefix}{name}.npy")
         stream = io.BytesIO(data)
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError(f"{name} is no npy file of version 1.0")

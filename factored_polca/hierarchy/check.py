@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import networkx as nx
 import numpy as np
 
@@ -9,7 +11,11 @@ from factored_polca.minimisation import flat_process, reduce
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, check_tasks, resolve_tasks
 from factored_polca.models.tasks import Task
 from factored_polca.solvers import METHODS, solve_mdp
+from factored_polca.solvers.pomdp_choose import POMDP_METHODS
 from factored_polca.symbolic import SymbolicModel
+
+TASK_METHODS: Final = tuple(method for method in POMDP_METHODS if method != "witness")
+"""Solvers of a task whose state is not seen; the witness algorithm needs a horizon, which tasks lack."""
 
 
 def task_graph(hierarchy: TaskHierarchy) -> nx.DiGraph:
@@ -38,17 +44,18 @@ def planning_order(hierarchy: TaskHierarchy) -> list[Task]:
     return [hierarchy.task(name) for name in ordered]
 
 
-def checked(model: Model, hierarchy: TaskHierarchy) -> TaskHierarchy:
-    """`hierarchy` with its names resolved.
+def checked(model: Model, hierarchy: TaskHierarchy, *, assume_observed: bool = False) -> TaskHierarchy:
+    """`hierarchy` with its names resolved; `assume_observed`: without its solvers of POMDPs being checked.
 
     Raises:
         ModelError: with every structural fault; warnings are left out.
     """
     resolved = resolve_tasks(model, hierarchy)
     faults: list[Fault] = check_tasks(model, resolved)
-    for task in resolved.tasks:
+    solver = solver_of if model.observability == "full" else pomdp_solver_of
+    for task in () if assume_observed else resolved.tasks:
         try:
-            solver_of(task)
+            solver(task)
         except ModelError as error:
             faults += error.faults
     if faults:
@@ -69,6 +76,27 @@ def solver_of(task: Task, default: str = "auto") -> str:
         listed = ", ".join(["auto", *short, *METHODS])
         raise ModelError(
             [Fault(f"no solver {method!r} for MDPs", ("tasks", task.name, "solver"), f"there are {listed}")]
+        )
+    return method
+
+
+def pomdp_solver_of(task: Task, default: str = "auto") -> str:
+    """The solver of a task whose state is not seen, `default` where it names none.
+
+    Raises:
+        ModelError: unknown; the message lists those there are.
+    """
+    method = task.solver or default
+    if method not in TASK_METHODS:
+        listed = ", ".join(TASK_METHODS)
+        raise ModelError(
+            [
+                Fault(
+                    f"no solver {method!r} for tasks of POMDPs",
+                    ("tasks", task.name, "solver"),
+                    f"there are {listed}",
+                )
+            ]
         )
     return method
 

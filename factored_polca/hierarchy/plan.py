@@ -15,13 +15,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, relabel
 from factored_polca.hierarchy.check import checked, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_q_values
+from factored_polca.hierarchy.options import Options
+from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
@@ -38,30 +40,8 @@ from factored_polca.models import (
 from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
 from factored_polca.symbolic import SymbolicModel, compile_model
 
-FLAT_BLOCK_LIMIT = 100_000
-"""Blocks up to which the flat optimum is computed beside the hierarchical policy."""
-
 Progress = Callable[[str, str, int, int], None]
 """Called with (task, stage, round, blocks)."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to plan.
-
-    `epsilon` is the gap that solvers close, relative to the largest value; `flat_block_limit` None
-    leaves the flat optimum out; `reachable` restricts every subtask to what the start can reach.
-    """
-
-    seed: int = 0
-    epsilon: float = 1e-9
-    order: str | Sequence[str] = "auto"
-    reachable: bool = False
-    block_limit: int | None = None
-    flat_block_limit: int | None = FLAT_BLOCK_LIMIT
-    memory_limit: int | None = None
-    deadline: float | None = None
-    solver: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -121,8 +101,30 @@ def plan(
     options: Options | None = None,
     *,
     progress: Progress | None = None,
+) -> HierarchicalPlan | PomdpPlan:
+    """Plan a model with PolCA, or with PolCA+ where its state is not seen; without tasks, as one flat task.
+
+    Raises:
+        ModelError: the model or the hierarchy is not right, or a start state can't avoid a dead end.
+        LimitReached: memory, blocks, observations or time.
+    """
+    options = options or Options()
+    if isinstance(model, Model) and model.observability == "partial" and not options.assume_observed:
+        return plan_pomdp(model, tasks, options, progress=progress)
+    return plan_mdp(model, tasks, options, progress=progress)
+
+
+def plan_mdp(
+    model: Model,
+    tasks: TaskHierarchy | None = None,
+    options: Options | None = None,
+    *,
+    progress: Progress | None = None,
 ) -> HierarchicalPlan:
-    """Plan a fully observed model with PolCA; without tasks, as one flat task.
+    """Plan a model with PolCA; without tasks, as one flat task.
+
+    A partially observed model is planned as if its state were seen where `options.assume_observed` says so:
+    the paper's PolCA run on a POMDP.  All values are then those of seeing the state.
 
     Raises:
         ModelError: the model or the hierarchy is not right, or a start state can't avoid a dead end.
@@ -136,13 +138,13 @@ def plan(
         )
     options = options or Options()
     began = time.perf_counter()
-    if model.observability != "full":
+    if model.observability != "full" and not options.assume_observed:
         raise ModelError(
             [
                 Fault(
-                    "planning partially observed models is not part of this version",
+                    "the model is partially observed",
                     ("observability",),
-                    'plan needs observability = "full"',
+                    "plan_pomdp plans it; with assume_observed it is planned as if the state were seen",
                 )
             ]
         )
@@ -150,7 +152,7 @@ def plan(
         raise ModelError(
             [Fault("a finite horizon can't be planned for", ("horizon",), "remove it, or give a discount")]
         )
-    hierarchy = checked(model, tasks or flat_task(model))
+    hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
     symbolic = compile_model(
         model,
         order=options.order,
@@ -229,7 +231,7 @@ class _Planner:
         """Steps 2 to 4 of PolCA for one task."""
         began = time.perf_counter()
         self.tell(task.name, "parameterise")
-        method = solver_of(task, self.options.solver)
+        method = "auto" if self.options.assume_observed else solver_of(task, self.options.solver)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.reduce(task.name, process, self.options.block_limit)
         refuse_without_purpose(task, reduction.quotient.mdp)
@@ -277,6 +279,7 @@ class _Planner:
             process = flat_process(
                 self.symbolic, reachable=reachable, terminal=root.reduction.process.terminal
             )
+            process = replace(process, channels=None)
             reduction = self.reduce("flat optimum", process, limit)
             solution = self.optimise("flat optimum", reduction, "auto")
         except LimitReached as error:

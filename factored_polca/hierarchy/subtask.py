@@ -6,17 +6,21 @@
 one step, not the whole run of the child.  R_h is the task's local reward, defined for every
 primitive below the task.  A child is not applicable where its policy is undefined: where it has
 ended, and where it has a dead end.
+
+Where the state is not seen, O(o, c, s') is set likewise (section 4.4): the kernel of c at s is the joint
+one of pi_c(s), pi_c(s) being what the child does where it is certain of s.  There a child is applicable
+everywhere, for its parent may not know whether it has ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
 from factored_polca.diagrams import Diagram
 from factored_polca.explicit.arrays import ArrayMDP
-from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.minimisation import Choice, DecisionProcess
 from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.models import Fault, Model, ModelError, Task
@@ -29,19 +33,35 @@ from factored_polca.symbolic import (
 )
 
 
+class Child(Protocol):
+    """What a parent needs of a solved child: its policy, state -> primitive, and where that is defined."""
+
+    @property
+    def policy(self) -> Diagram:
+        """State -> number of the primitive action."""
+
+    @property
+    def defined(self) -> Diagram:
+        """Where `policy` counts."""
+
+
 def subtask_process(
-    symbolic: SymbolicModel, task: Task, children: Mapping[str, SolvedTask], reachable: Diagram | None
+    symbolic: SymbolicModel,
+    task: Task,
+    children: Mapping[str, Child],
+    reachable: Diagram | None,
+    channels: tuple[int, ...] | None = None,
 ) -> DecisionProcess:
     """The decision process of `task`, given its children solved.
+
+    `channels` are the numbers of the observations that it plans with, None where the state is seen.
 
     Raises:
         ModelError: a condition or reward that is undefined somewhere.
     """
     manager = symbolic.manager
-    path = ("tasks", task.name)
     everywhere = manager.constant(1)
-    ends = compile_condition(symbolic, task.terminal, (*path, "terminal"), ~symbolic.terminal)
-    terminal = ends | symbolic.terminal
+    terminal = ended_condition(symbolic, task)
     live = ~terminal & (everywhere if reachable is None else reachable)
     numbers = {action.name: index for index, action in enumerate(symbolic.actions)}
     choices = []
@@ -56,7 +76,20 @@ def subtask_process(
             choices.append(Choice(name, app, below, child.policy))
     primitives = sorted({p for choice in choices for p in choice.primitives})
     rewards = {p: local_reward(symbolic, task, p, live) for p in primitives}
-    return DecisionProcess(symbolic, tuple(choices), terminal, rewards, reachable)
+    return DecisionProcess(symbolic, tuple(choices), terminal, rewards, reachable, channels)
+
+
+def ended_condition(symbolic: SymbolicModel, task: Task) -> Diagram:
+    """Where a task, or the model, has ended."""
+    path = ("tasks", task.name, "terminal")
+    return compile_condition(symbolic, task.terminal, path, ~symbolic.terminal) | symbolic.terminal
+
+
+def planning_channels(model: Model, task: Task) -> tuple[int, ...]:
+    """The numbers of the observations that a task plans with: those it lists in `observes`, or all."""
+    if task.observes is None:
+        return tuple(range(len(model.observations)))
+    return tuple(j for j, channel in enumerate(model.observations) if channel.name in task.observes)
 
 
 def local_expressions(model: Model, task: Task, action: int) -> list[tuple[Expression, tuple[str, ...]]]:

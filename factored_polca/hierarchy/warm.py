@@ -10,7 +10,8 @@ import time
 
 from factored_polca.diagrams import INDEX, dump, load, states_of_leaves
 from factored_polca.diagrams.jit import compiled_before
-from factored_polca.hierarchy.plan import Options, plan
+from factored_polca.hierarchy.options import Options
+from factored_polca.hierarchy.plan import plan_mdp
 from factored_polca.models import Action, Feature, Model
 
 
@@ -30,7 +31,7 @@ def is_compiled() -> bool:
 def warm_up() -> float:
     """Compile, or load from disk, the kernels; answer the seconds it took."""
     began = time.perf_counter()
-    found = plan(tiny_model(), options=Options(memory_limit=1 << 28))
+    found = plan_mdp(tiny_model(), options=Options(memory_limit=1 << 28))
     policy, manager = found.root.policy, found.symbolic.manager
     states_of_leaves(policy, found.symbolic.now_levels)
     load(manager, dump(policy), INDEX)

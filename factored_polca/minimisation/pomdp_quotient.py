@@ -161,7 +161,7 @@ def make_pomdp_quotient(
         kernel=tuple(found.matrices for found in kernels),
         rewards=np.stack([_rewards(process, taken, states) for taken in primitive]),
         terminal=terminal,
-        observed=_observed(symbolic, states),
+        observed=seen_of_blocks(symbolic, states),
         initial=initial_distribution(partition),
         discount=float(symbolic.model.discount),
     )
@@ -197,7 +197,7 @@ def _rewards(process: DecisionProcess, taken: Int32Array, states: Int32Array) ->
     return result
 
 
-def _observed(symbolic: SymbolicModel, states: Int32Array) -> Int64Array:
+def seen_of_blocks(symbolic: SymbolicModel, states: Int32Array) -> Int64Array:
     """What is seen of each block, from 0: the values of the observed features."""
     seen = [i for i, feature in enumerate(symbolic.model.features) if feature.observed]
     _, numbers = np.unique(states[:, seen], axis=0, return_inverse=True)

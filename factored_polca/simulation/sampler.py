@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import evaluate_states
+from factored_polca.models.features import position
 from factored_polca.symbolic import RowDiagram, SymbolicModel, Term
 
 States = npt.NDArray[np.int32]  # [episode, feature] value numbers
@@ -48,6 +49,38 @@ class Sampler:
             following[mine] = drawn
             rewards[mine] = self._rewards(action.sampled_rewards, states[mine], drawn)
         return following, rewards
+
+    def observe(
+        self,
+        states: States,
+        actions: npt.NDArray[np.int64],
+        following: States,
+        generator: np.random.Generator,
+    ) -> npt.NDArray[np.int64]:
+        """What the channels report after steps [episode, channel]; a channel not sensed its null value.
+
+        One uniform number is drawn for each episode and channel, whatever the actions are.
+        """
+        channels = self.symbolic.model.observations
+        uniform = generator.random((len(states), len(channels)))
+        nulls = [position(channel.values, channel.null) or 0 for channel in channels]
+        result = np.tile(np.array(nulls, dtype=np.int64), (len(states), 1))
+        for number in np.unique(actions[actions >= 0]).tolist():
+            mine = np.flatnonzero(actions == number)
+            pairs = np.concatenate([states[mine], following[mine]], axis=1)
+            for channel, row in self.symbolic.actions[number].observations.items():
+                chosen = evaluate_states(row.diagram, pairs, self._columns).astype(np.int64)
+                below = self._table(row)[chosen] <= uniform[mine, channel, None]
+                result[mine, channel] = below.sum(axis=1)
+        return result
+
+    def expected_rewards(self, terms: Sequence[Term], states: States) -> FloatArray:
+        """The sum of reward terms over present states alone, expectations taken [episode]."""
+        total = np.zeros(len(states))
+        for term in terms:
+            values = np.array([float(value) for value in term.values])
+            total += values[evaluate_states(term.diagram, states, self._columns).astype(np.int64)]
+        return total
 
     def _draw(
         self,

@@ -1,0 +1,254 @@
+"""The command `plan`: PolCA for models whose state is seen, PolCA+ for those whose state is not."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+from factored_polca.cli.commands import (
+    compile_kernels,
+    limits,
+    peak_memory_bytes,
+    refuse_unwritable,
+    report_warnings,
+)
+from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
+from factored_polca.cli.source import Source, load
+from factored_polca.models import LimitReached, ModelError
+
+if TYPE_CHECKING:
+    from factored_polca.hierarchy import HierarchicalPlan, Options, PomdpPlan
+    from factored_polca.simulation.measure import Measurement
+
+
+def plan(arguments: argparse.Namespace, output: Output) -> int:
+    """Plan a hierarchy, print the table, write the plan."""
+    if arguments.output is not None:
+        refuse_unwritable(arguments.output)
+    source = load(arguments.model, arguments.set, arguments.tasks)
+    partial = source.model.observability == "partial" and not arguments.polca
+    if arguments.polca and source.model.observability == "full":
+        output.note("the state is seen: --polca changes nothing")
+    report_warnings(source, output)
+    compile_seconds = compile_kernels(output, "sarsop" if partial else None)
+    if source.tasks is None:
+        output.note(f"{source.name} has no tasks: planning one flat task with all actions")
+    work = plan_partial if partial else plan_full
+    data = work(source, options_of(arguments), arguments, output, compile_seconds)
+    if arguments.json:
+        output.result(data)
+        return 0
+    (print_pomdp_plan if partial else print_plan)(data, output)
+    if arguments.output is not None:
+        output.note(f"plan written to {arguments.output}; try: factored-polca simulate {arguments.output}")
+    return 0
+
+
+def options_of(arguments: argparse.Namespace) -> Options:
+    """The planner's options, from the command line."""
+    from factored_polca.hierarchy import Options
+
+    memory, deadline = limits(arguments)
+    return Options(
+        seed=arguments.seed,
+        order=arguments.order,
+        reachable=arguments.reachable,
+        memory_limit=memory,
+        deadline=deadline,
+        flat_block_limit=None if arguments.no_flat else arguments.flat_blocks,
+        solver=arguments.solver,
+        gap=arguments.gap,
+        trials=arguments.trials,
+        assume_observed=arguments.polca,
+    )
+
+
+def figures(arguments: argparse.Namespace, source: Source, compile_seconds: float) -> dict[str, Any]:
+    """What the whole command took."""
+    return {
+        "parse_seconds": source.parse_seconds,
+        "compile_seconds": compile_seconds,
+        "total_seconds": time.perf_counter() - arguments.began,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+
+
+def plan_full(
+    source: Source,
+    options: Options,
+    arguments: argparse.Namespace,
+    output: Output,
+    compile_seconds: float,
+) -> dict[str, Any]:
+    """PolCA: the figures of the plan, which is written where that is asked for."""
+    from factored_polca.hierarchy import plan_mdp
+    from factored_polca.hierarchy.executable import executable
+    from factored_polca.hierarchy.plan_file import save_plan
+    from factored_polca.hierarchy.report import plan_report
+
+    def progress(task: str, stage: str, number: int, blocks: int) -> None:
+        detail = f": round {number}, {blocks:,} blocks" if blocks else ""
+        output.update(f"{task}: {stage}{detail}")
+
+    with source.located(), output.progress(f"planning {source.name}"):
+        found = plan_mdp(source.model, source.tasks, options, progress=progress)
+    data = plan_report(found) | figures(arguments, source, compile_seconds)
+    for warning in found.warnings:
+        output.warn(warning)
+    if arguments.output is not None:
+        save_plan(executable(found, finite(data)), arguments.output)
+    return data
+
+
+def plan_partial(
+    source: Source,
+    options: Options,
+    arguments: argparse.Namespace,
+    output: Output,
+    compile_seconds: float,
+) -> dict[str, Any]:
+    """PolCA+: the figures of the plan, measured, which is written where that is asked for."""
+    from factored_polca.hierarchy import plan_pomdp
+    from factored_polca.hierarchy.pomdp_executable import executable_pomdp
+    from factored_polca.hierarchy.pomdp_plan_file import save_pomdp_plan
+    from factored_polca.hierarchy.pomdp_report import pomdp_plan_report
+    from factored_polca.simulation.measure import measure
+
+    def progress(task: str, stage: str, number: int, blocks: int) -> None:
+        detail = f": round {number}, {blocks:,} blocks" if number else ""
+        output.update(f"{task}: {stage}{detail}")
+
+    with source.located(), output.progress(f"planning {source.name}"):
+        found = plan_pomdp(source.model, source.tasks, options, progress=progress)
+        polca = planned_as_seen(source, options, output)
+        policy = executable_pomdp(found)
+        output.update(f"measuring {source.name}: {arguments.episodes:,} episodes")
+        measured = measure(policy, episodes=arguments.episodes, seed=arguments.seed)
+    data = pomdp_plan_report(found, polca) | measured_figures(found, measured)
+    data |= figures(arguments, source, compile_seconds)
+    for warning in found.warnings:
+        output.warn(warning)
+    if arguments.output is not None:
+        save_pomdp_plan(executable_pomdp(found, finite(data)), arguments.output)
+    return data
+
+
+def planned_as_seen(source: Source, options: Options, output: Output) -> HierarchicalPlan | None:
+    """The same hierarchy planned as if the state were seen, for comparison; None where PolCA can't."""
+    from dataclasses import replace
+
+    from factored_polca.hierarchy import plan_mdp
+
+    try:
+        seen = replace(options, assume_observed=True, flat_block_limit=None, solver="auto")
+        return plan_mdp(source.model, source.tasks, seen)
+    except (ModelError, LimitReached) as error:
+        output.note(f"PolCA, for comparison, is left out: {error}")
+        return None
+
+
+def measured_figures(found: PomdpPlan, measured: Measurement) -> dict[str, Any]:
+    """What polling earned, and how beliefs were tracked."""
+    runs = measured.runs[found.root.task.name]
+    return {
+        "value": runs.mean,
+        "standard_error": runs.standard_error,
+        "lower": found.root.lower,
+        "upper": found.root.upper,
+        "episodes": runs.episodes,
+        "steps": runs.steps,
+        "truncation": runs.truncation,
+        "measured": {
+            name: {"value": run.mean, "standard_error": run.standard_error, "episodes": run.episodes}
+            for name, run in measured.runs.items()
+        },
+        "action_counts": {
+            action.name: int(count)
+            for action, count in zip(found.model.actions, runs.counts.tolist(), strict=True)
+        },
+        "tracker": measured.tracker.kind,
+        "tracker_reason": measured.tracker.reason,
+    }
+
+
+def print_plan(data: dict[str, Any], output: Output) -> None:
+    """The figures of a plan by PolCA for people."""
+    columns = {
+        "task": "left", "actions": "right", "blocks": "right", "Q-values": "right", "classes": "right",
+        "shared": "right", "value": "right", "time": "right",
+    }  # fmt: skip
+    table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
+    for row in data["tasks"]:
+        value = "none" if row["value"] == -math.inf else f"{row['value']:.6g}"
+        table.add_row(
+            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}", f"{row['q_values']:,}",
+            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", value, seconds(row["seconds"]),
+        )  # fmt: skip
+    table.add_section()
+    total = data["totals"]
+    table.add_row(
+        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", f"{total['q_values']:,}",
+        f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
+    )  # fmt: skip
+    output.table(table)
+    output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
+    output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
+    if data["flat_value"] is None:
+        output.line(f"flat optimum: {escape(data['flat_note'])}")
+    else:
+        cost = data["flat_value"] - data["value"]
+        said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
+        output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
+    output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
+    """The figures of a plan by PolCA+ for people."""
+    columns = {
+        "task": "left", "actions": "right", "blocks": "right", "observations": "right",
+        "unabstracted": "right", "PolCA": "right", "PolCA+": "right", "as planned": "right",
+        "corner gap": "right", "measured": "right", "time": "right",
+    }  # fmt: skip
+    table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
+    for row in data["tasks"]:
+        counts, measured = row["observations"].values(), data["measured"].get(row["name"])
+        table.add_row(
+            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}",
+            f"{sum(c['before'] for c in counts):,} -> {sum(c['after'] for c in counts):,}",
+            *parameters_text(row["parameters"]), f"{row['lower']:.5g} .. {row['upper']:.5g}",
+            f"{row['corner_gap']:.2g}", "" if measured is None else measured_text(measured),
+            seconds(row["seconds"]),
+        )  # fmt: skip
+    table.add_section()
+    table.add_row(
+        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", "",
+        *parameters_text(data["totals"]["parameters"]), "", "", "", seconds(data["seconds"]),
+    )  # fmt: skip
+    output.table(table)
+    output.line(
+        "observations: joint ones of all actions, before and after merging; unabstracted, PolCA, PolCA+: "
+        "parameters of the task's model (Figure 4a); as planned: bounds in the task's own model, where a "
+        "child does what it does when certain of the state"
+    )
+    output.line(
+        f"the hierarchical policy earns [bold]{data['value']:.6g}[/] ± {data['standard_error']:.2g} from "
+        f"the start (mean and standard error, {data['episodes']:,} episodes of {data['steps']:,} steps)"
+    )
+    if data["flat_upper"] is None:
+        output.line(f"bound on all policies: {escape(data['flat_note'])}")
+    else:
+        output.line(f"no policy earns more than {data['flat_upper']:.6g} ({escape(data['flat_note'])})")
+    output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
+    output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def parameters_text(parameters: dict[str, int | None]) -> list[str]:
+    """The three numbers of parameters; a dash where one is not known."""
+    return ["-" if count is None else f"{count:,}" for count in parameters.values()]
+
+
+def measured_text(measured: dict[str, Any]) -> str:
+    """A mean with its standard error."""
+    return f"{measured['value']:.5g} ± {measured['standard_error']:.2g}"

@@ -1,0 +1,109 @@
+"""The polling controller over beliefs (the paper's section 4.4): at every step ask from the top.
+
+One belief serves all tasks.  At each step it is projected onto the root's blocks and the root's policy
+asked; the child that it answers is asked at the same belief over *its* blocks, and so on until a primitive
+action comes back.  There is no stack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factored_polca.control.polling import ask
+from factored_polca.control.tracker import Belief, ChosenTracker, OnImpossible, choose_tracker
+from factored_polca.diagrams import support
+from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
+
+
+@dataclass(frozen=True)
+class BeliefPoll:
+    """One question on the way down: the task, its answer, and what the task believed.
+
+    `block` is the likeliest block of the task, `probability` the belief's mass there; `ended` whether the
+    belief is sure that the task has ended; `looked_ahead` whether the policy's own answer was a child that
+    has surely ended, and another one was found by looking one step ahead.
+    """
+
+    task: str
+    block: int
+    block_states: int
+    probability: float
+    action: str
+    ended: bool
+    looked_ahead: bool
+
+
+@dataclass(frozen=True)
+class BeliefDecision:
+    """The primitive action at a belief, and the polls that led to it."""
+
+    action: str
+    number: int
+    path: tuple[BeliefPoll, ...]
+
+
+def tracked_features(plan: ExecutablePomdpPlan) -> list[str]:
+    """The features that some task tells apart, or that are seen: those whose marginals are of use."""
+    symbolic = plan.symbolic
+    tested = {level for partition in plan.partitions for level in support(partition.diagram)}
+    return [
+        feature.name
+        for number, feature in enumerate(plan.model.features)
+        if feature.observed or symbolic.now(number) in tested
+    ]
+
+
+def plan_tracker(
+    plan: ExecutablePomdpPlan, *, on_impossible: OnImpossible = "error", seed: int = 0
+) -> ChosenTracker:
+    """The tracker that fits a plan: on the common refinement of its tasks, else others."""
+    return choose_tracker(
+        plan.symbolic,
+        plan.partitions,
+        conditions=plan.conditions,
+        features=tracked_features(plan),
+        on_impossible=on_impossible,
+        seed=seed,
+    )
+
+
+class BeliefController:
+    """Executes a plan of a partially observed model; it holds no state of its own."""
+
+    def __init__(self, plan: ExecutablePomdpPlan) -> None:
+        self.plan = plan
+        self._numbers = {action.name: i for i, action in enumerate(plan.symbolic.actions)}
+
+    def poll(self, belief: Belief) -> BeliefDecision:
+        """The action at a belief.
+
+        Raises:
+            ModelError: the belief's tracker does not tell apart what the plan does, or holds states
+                possible that the plan was not made for.
+        """
+        plan, path = self.plan, list[BeliefPoll]()
+        name = plan.root
+        while name in plan.policies:
+            task = plan.policies[name]
+            over_blocks = belief.project(task.partition)
+            sure = [
+                action in plan.policies and belief.support_in(plan.policies[action].ended)
+                for action in task.actions
+            ]
+            chosen, ahead = ask(plan, name, over_blocks[None, :], np.array([sure]))
+            block = int(over_blocks.argmax())
+            path.append(
+                BeliefPoll(
+                    task=name,
+                    block=block,
+                    block_states=task.partition.sizes[block],
+                    probability=float(over_blocks[block]),
+                    action=task.actions[int(chosen[0])],
+                    ended=bool(over_blocks[~task.terminal].sum() == 0),
+                    looked_ahead=bool(ahead[0]),
+                )
+            )
+            name = path[-1].action
+        return BeliefDecision(name, self._numbers[name], tuple(path))

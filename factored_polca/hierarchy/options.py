@@ -1,0 +1,47 @@
+"""How to plan a hierarchy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from factored_polca.minimisation.pomdp_quotient import MAXIMUM_OBSERVATIONS
+
+FLAT_BLOCK_LIMIT: Final = 100_000
+"""Blocks up to which something flat is computed beside the hierarchical policy."""
+
+TRIALS: Final = 100
+"""Trials of the search that solves a task whose state is not seen, at most."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to plan.
+
+    `flat_block_limit` None leaves out what is said about flat policies: the optimum of a fully observed
+    model, an upper bound on it of a partially observed one.  `reachable` restricts every subtask to what
+    the start can reach.  `solver` is for tasks that name none.
+
+    For models whose state is seen (PolCA) `epsilon` is the gap that solvers close, relative to the
+    largest value.
+
+    For those whose state is not (PolCA+) solvers stop where upper - lower <= `gap` at the initial belief,
+    and for children at all corners, and after `trials` trials; `gap` None is a thousandth of the span of
+    the task's rewards.  `maximum_observations` caps the joint observations of one action of a task.
+    `assume_observed` plans a partially observed model as if the state were seen (PolCA).
+    """
+
+    seed: int = 0
+    epsilon: float = 1e-9
+    order: str | Sequence[str] = "auto"
+    reachable: bool = False
+    block_limit: int | None = None
+    flat_block_limit: int | None = FLAT_BLOCK_LIMIT
+    memory_limit: int | None = None
+    deadline: float | None = None
+    solver: str = "auto"
+    gap: float | None = None
+    trials: int | None = TRIALS
+    maximum_observations: int = MAXIMUM_OBSERVATIONS
+    assume_observed: bool = False

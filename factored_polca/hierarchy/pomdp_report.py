@@ -1,0 +1,92 @@
+"""A plan of a partially observed model as plain data: what `plan --json` prints and plan files keep."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from factored_polca.hierarchy.parameters import mdp_parameters, pomdp_parameters, unreduced_parameters
+from factored_polca.hierarchy.plan import HierarchicalPlan
+from factored_polca.hierarchy.pomdp_plan import PomdpPlan
+from factored_polca.hierarchy.pomdp_solved import SolvedPomdpTask
+
+
+def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) -> dict[str, Any]:
+    """Figures of a plan: the tasks children first, and what no policy can exceed.
+
+    `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.
+    """
+    processes = [solved.reduction.process for solved in plan.solved]
+    none = unreduced_parameters(plan.symbolic, processes)
+    tasks = [
+        task_report(solved)
+        | {
+            "parameters": {
+                "none": None if none is None else none[number],
+                "polca": None if polca is None else polca_parameters(polca, solved.task.name),
+                "polca_plus": pomdp_parameters(solved.reduction.pomdp_quotient.pomdp),
+            }
+        }
+        for number, solved in enumerate(plan.solved)
+    ]
+    return {
+        "model": plan.model.name,
+        "states": plan.model.states,
+        "method": "PolCA+",
+        "discount": float(plan.model.discount),
+        "flat_upper": plan.flat.upper,
+        "flat_blocks": plan.flat.blocks,
+        "flat_note": plan.flat.note,
+        "guarantee": guarantee(plan),
+        "tasks": tasks,
+        "totals": {"parameters": {key: total(tasks, key) for key in ("none", "polca", "polca_plus")}},
+        "warnings": list(plan.warnings),
+        "order": list(plan.symbolic.order),
+        "seconds": plan.seconds,
+    }
+
+
+def polca_parameters(polca: HierarchicalPlan, name: str) -> int:
+    """The parameters of one task as PolCA sees it."""
+    return mdp_parameters(polca.task(name).reduction.quotient.mdp)
+
+
+def total(tasks: list[dict[str, Any]], key: str) -> int | None:
+    """The parameters of all tasks, None where those of one are not known."""
+    counts = [task["parameters"][key] for task in tasks]
+    return None if None in counts else sum(counts)
+
+
+def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
+    """Figures of one task."""
+    quotient, solution = solved.reduction.pomdp_quotient, solved.solution
+    before, after = quotient.observations_before, quotient.observations_after
+    return {
+        "name": solved.task.name,
+        "actions": list(solved.task.actions),
+        "blocks": solved.reduction.partition.blocks,
+        "observations": {
+            name: {"before": before[c], "after": after[c]} for c, name in enumerate(solved.task.actions)
+        },
+        "lower": solved.lower,
+        "upper": solved.upper,
+        "corner_gap": solved.corner_gap,
+        "solver": solution.method,
+        "status": solution.status,
+        "guarantee": solution.guarantee.text,
+        "vectors": solution.vectors,
+        "iterations": solution.iterations,
+        "ties": solved.ties,
+        "collision_bound": solved.reduction.minimisation.collision_bound,
+        "minimise_seconds": solved.minimise_seconds,
+        "seconds": solved.seconds,
+    }
+
+
+def guarantee(plan: PomdpPlan) -> str:
+    """How far the values may be trusted, in words."""
+    chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
+    return (
+        "each task's bounds hold in its own model, given what its children do where they are certain; what "
+        "the polled policy earns is measured; each partition exact but for a chance below "
+        f"{max(chance, 1e-300):.1g}"
+    )

@@ -1,0 +1,1 @@
+"""Studies: figures and tables of the paper, from our own runs."""
