@@ -118,6 +118,15 @@ def test_minimise_with_some_actions_only(run_json: Run) -> None:
     assert run_json("minimise", "taxi", "--actions", "North,South,East,West")["blocks"] == 2
 
 
+def test_minimise_counts_joint_observations_before_and_after(run_json: Run, run_text: Run) -> None:
+    data = run_json("minimise", "tiger")
+    counts = {name: (c["before"], c["after"]) for name, c in data["observations"].items()}
+    # Behind an opened door one hears either side, each with chance 1/2 (Kaelbling et al. 1998).
+    assert counts == {"listen": (2, 2), "open_left": (2, 1), "open_right": (2, 1)}
+    assert "joint observations" in run_text("minimise", "tiger")
+    assert "observations" not in run_json("minimise", "taxi")
+
+
 def test_minimise_certifies(run_json: Run, run_text: Run) -> None:
     data = run_json("minimise", "toy", "--certify")
     assert data["certified"] is True

@@ -38,7 +38,7 @@ from factored_polca.minimisation import Partition, flat_process, minimise, parti
 from factored_polca.models import Action, Feature, Model, ModelError, Observation, Value, boolean
 from factored_polca.symbolic import SymbolicModel, compile_model, reachable_states
 
-SEEDS = range(110)
+SEEDS = range(200)
 ROUNDING = 1e-12  # sums and products of up to 64 floats, a dozen steps
 
 # -- the oracle ------------------------------------------------------------------------------------

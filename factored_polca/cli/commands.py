@@ -19,6 +19,9 @@ from factored_polca.models import LimitReached
 if TYPE_CHECKING:
     from factored_polca.simulation import Simulation
 
+ACTIONS_SHOWN = 30
+"""Actions in a table before the rest is summed up."""
+
 SMALLEST_STORE = 1 << 20
 """Bytes without which no model fits."""
 
@@ -83,7 +86,7 @@ def report_warnings(source: Source, output: Output) -> None:
 
 def minimise(arguments: argparse.Namespace, output: Output) -> int:
     """Minimise a model, print the figures."""
-    from factored_polca.minimisation import flat_process
+    from factored_polca.minimisation import flat_process, observation_counts
     from factored_polca.minimisation import minimise as minimise_process
     from factored_polca.symbolic import compile_model
     from factored_polca.symbolic.reach import reachable_states
@@ -112,6 +115,11 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
                 f"minimising {source.name}: round {number}, {blocks:,} blocks"
             ),
         )
+        if process.partial:
+            data["observations"] = {
+                found.choice: {"before": found.before, "after": found.after}
+                for found in observation_counts(process, result.partition)
+            }
     elapsed = time.perf_counter() - began
     peak_nodes, _ = symbolic.manager.peaks()
     data |= {
@@ -170,8 +178,22 @@ def print_minimisation(data: dict[str, Any], output: Output) -> None:
     table.add_row("kernels loaded or compiled", seconds(data["compile_seconds"]))
     table.add_row("peak memory", f"{data['peak_memory_bytes'] / 2**20:,.0f} MiB")
     output.table(table)
+    if "observations" in data:
+        print_observations(data["observations"], output)
     for failure in data.get("certificate", {}).get("failures", ())[:10]:
         output.line(f"[red]{escape(failure)}[/]")
+
+
+def print_observations(counts: dict[str, dict[str, int]], output: Output) -> None:
+    """The joint observations of each action, those with most first."""
+    columns = {"action": "left", "observations": "right", "merged": "right"}
+    table = make_table("joint observations, merged without loss channel by channel", columns)
+    ordered = sorted(counts.items(), key=lambda item: -item[1]["after"])
+    for name, count in ordered[:ACTIONS_SHOWN]:
+        table.add_row(escape(name), big(count["before"]), big(count["after"]))
+    if len(ordered) > ACTIONS_SHOWN:
+        table.add_row(f"... {len(ordered) - ACTIONS_SHOWN} more", "", "")
+    output.table(table)
 
 
 def refuse_unwritable(path: str) -> None:

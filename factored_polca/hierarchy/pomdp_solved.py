@@ -84,8 +84,10 @@ def corner_choices(policy: BeliefPolicy, blocks: int) -> tuple[IntArray, int]:
 def root_beliefs(pomdp: ArrayPOMDP) -> FloatArray:
     """The beliefs [r, block] that a child is solved for: all corners, the uniform one, the initial one."""
     live = np.flatnonzero(~pomdp.terminal)
+    if len(live) == 0:  # the task has ended wherever it is called
+        return pomdp.initial[None, :]
     corners = np.zeros((len(live) + 2, pomdp.states))
     corners[np.arange(len(live)), live] = 1.0
-    corners[len(live), live] = 1.0 / max(1, len(live))
+    corners[len(live), live] = 1.0 / len(live)
     corners[len(live) + 1] = pomdp.initial
     return corners
