@@ -118,6 +118,14 @@ def test_minimise_with_some_actions_only(run_json: Run) -> None:
     assert run_json("minimise", "taxi", "--actions", "North,South,East,West")["blocks"] == 2
 
 
+def test_minimise_exchanges_actions_where_the_state_is_seen(run_json: Run) -> None:
+    named = run_json("minimise", "sysadmin", "--set", "size=5")
+    exchanged = run_json("minimise", "sysadmin", "--set", "size=5", "--interchangeable")
+    assert exchanged["interchangeable"]
+    # Ring of five machines: necklaces of five beads in two colours, against all 2^5 states.
+    assert (exchanged["blocks"], named["blocks"]) == (8, 32)
+
+
 def test_minimise_counts_joint_observations_before_and_after(run_json: Run, run_text: Run) -> None:
     data = run_json("minimise", "tiger")
     counts = {name: (c["before"], c["after"]) for name, c in data["observations"].items()}

@@ -91,6 +91,10 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.symbolic import compile_model
     from factored_polca.symbolic.reach import reachable_states
 
+    if arguments.interchangeable and arguments.certify:
+        raise UsageError(
+            "--certify checks partitions that keep actions by name, not --interchangeable ones"
+        )
     source = load(arguments.model, arguments.set)
     actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
     report_warnings(source, output)
@@ -111,6 +115,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
         result = minimise_process(
             process,
             seed=arguments.seed,
+            interchangeable=arguments.interchangeable,
             progress=lambda number, blocks: output.update(
                 f"minimising {source.name}: round {number}, {blocks:,} blocks"
             ),
@@ -125,6 +130,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     data |= {
         "blocks": result.partition.blocks,
         "rounds": result.rounds,
+        "interchangeable": arguments.interchangeable,
         "nodes": result.partition.nodes,
         "peak_nodes": peak_nodes,
         "collision_bound": result.collision_bound,

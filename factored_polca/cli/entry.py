@@ -90,6 +90,10 @@ def parser() -> argparse.ArgumentParser:
     with_limits(sub)
     sub.add_argument("--actions", metavar="A,B,...", help="only these actions count")
     sub.add_argument("--certify", action="store_true", help="check the partition without fingerprints")
+    sub.add_argument(
+        "--interchangeable", action="store_true",
+        help="actions count by what they do, not by name (where the state is seen)",
+    )  # fmt: skip
     sub = command("plan", "Plan a task hierarchy: PolCA, or PolCA+ where the state is not seen.")
     with_model(sub)
     with_limits(sub)

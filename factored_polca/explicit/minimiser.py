@@ -12,6 +12,7 @@ written out in full and compared as they are.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -73,6 +74,32 @@ def minimise(mdp: ExactMDP, states: Sequence[bool] | None = None) -> ExactPartit
         block_of, blocks = refined, count
 
 
+def minimise_interchangeable(mdp: ExactMDP, *, as_sets: bool = False) -> ExactPartition:
+    """The coarsest partition that keeps the multiset, or set, of the applicable actions' signatures.
+
+    The signature of an action at a state is its reward and its probability of entering each block.  With
+    sets these are the classes of the coarsest homomorphism (Ravindran & Barto 2003), names aside.
+    """
+    states, inside = range(mdp.states), [True] * mdp.states
+    block_of, blocks = _number(["terminal" if mdp.terminal[s] else "live" for s in states], inside)
+    initial_blocks, rounds = blocks, 0
+    while True:
+        rounds += 1
+        signatures: list[Hashable] = []
+        for s in states:
+            found = [
+                (mdp.rewards[a][s], _mass_by_block(mdp.rows[a][s], block_of))
+                for a in range(len(mdp.actions))
+                if mdp.applicable[a][s]
+            ]
+            counted = frozenset(found) if as_sets else frozenset(Counter(found).items())
+            signatures.append((block_of[s], None if mdp.terminal[s] else counted))
+        refined, count = _number(signatures, inside)
+        if count == blocks:
+            return ExactPartition(tuple(block_of), blocks, initial_blocks, rounds)
+        block_of, blocks = refined, count
+
+
 def minimise_pomdp(pomdp: ExactPOMDP) -> ExactPartition:
     """The coarsest partition of a POMDP that Eq. 13 of the paper keeps stable.
 
@@ -99,6 +126,14 @@ def minimise_pomdp(pomdp: ExactPOMDP) -> ExactPartition:
         if count == blocks:
             return ExactPartition(tuple(block_of), blocks, initial_blocks, rounds)
         block_of, blocks = refined, count
+
+
+def _mass_by_block(row: Row, block_of: Sequence[int]) -> frozenset[tuple[int, Fraction]]:
+    """The probability of entering each block."""
+    mass: dict[int, Fraction] = {}
+    for t, chance in row.items():
+        mass[block_of[t]] = mass.get(block_of[t], Fraction(0)) + chance
+    return frozenset(mass.items())
 
 
 def _entering(

@@ -2,6 +2,7 @@
 
 from factored_polca.minimisation.certify import Certificate, certify
 from factored_polca.minimisation.criterion import Choice, DecisionProcess, flat_process
+from factored_polca.minimisation.interchangeable import InterchangeableQuotient, interchangeable_quotient
 from factored_polca.minimisation.observations import ObservationCount, observation_counts
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.pomdp_quotient import PomdpQuotient, make_pomdp_quotient
@@ -14,6 +15,7 @@ __all__ = [
     "Certificate",
     "Choice",
     "DecisionProcess",
+    "InterchangeableQuotient",
     "Minimisation",
     "ObservationCount",
     "Partition",
@@ -23,6 +25,7 @@ __all__ = [
     "Unreduced",
     "certify",
     "flat_process",
+    "interchangeable_quotient",
     "make_pomdp_quotient",
     "make_quotient",
     "minimise",

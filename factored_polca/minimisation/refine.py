@@ -29,6 +29,9 @@ rounds that might have been the last.
 With observations f_c is the sensed regression (`factored_polca.symbolic.sensing`), a random multilinear
 form of the joint row over (block, observation): Eq. 13.  Observed features are separated in step 0.
 
+Where actions are interchangeable (`factored_polca.minimisation.interchangeable`) steps 0 and 1 compare the
+multiset of the choices' signatures instead of choice with choice.
+
 A block that is not split keeps its r_k (of a block that is, one part does), so that most of V, and
 with it most cached regressions, survive from pass to pass; and a choice whose f_c is the diagram it
 was before needs no pairing.
@@ -65,6 +68,7 @@ from factored_polca.minimisation.criterion import (
     row_denominator,
 )
 from factored_polca.minimisation.partition import Partition, partition_from
+from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
@@ -117,6 +121,7 @@ def minimise(
     block_limit: int | None = None,
     progress: Progress | None = None,
     separate: Sequence[Diagram] = (),
+    interchangeable: bool = False,
 ) -> Minimisation:
     """The coarsest stable partition of `process` that separates different rewards.
 
@@ -126,12 +131,16 @@ def minimise(
         confirmations: how many confirming rounds must pass.
         block_limit: stop beyond so many blocks.
         separate: index diagrams over states whose different values must not be merged.
+        interchangeable: choices are compared as a multiset, whatever their names.
 
     Raises:
+        ModelError: interchangeable choices of a partially observed process.
         LimitReached: blocks, memory or time; `partial` is the partition so far (None if even numbering
             its blocks takes more memory than there is).
     """
-    refinement = _Refinement(process, seed, block_limit, progress, separate)
+    if interchangeable:
+        refuse_partial(process)
+    refinement = _Refinement(process, seed, block_limit, progress, separate, interchangeable)
     start = time.perf_counter()
     try:
         refinement.run(confirmations)
@@ -158,9 +167,11 @@ class _Refinement:
         block_limit: int | None,
         progress: Progress | None,
         separate: Sequence[Diagram] = (),
+        interchangeable: bool = False,
     ) -> None:
         self.process = process
         self.separate = tuple(separate)
+        self.interchangeable = interchangeable
         self.manager = process.symbolic.manager
         self.random = random.Random(seed)
         self.generator = np.random.default_rng(seed)
@@ -188,6 +199,8 @@ class _Refinement:
         self.view = self.new_view(field)
         self.previous.clear()
         self.labels.elements = field.draw(self.generator, self.labels.blocks)
+        if self.interchangeable:
+            self.polynomial = Polynomial(self.view, field, self.generator)
 
     def new_view(self, field: Field) -> ProcessView:
         """The process in a field, with fresh draws for observations."""
@@ -233,6 +246,9 @@ class _Refinement:
             self.split(
                 diagram if reachable is None else choose(reachable, diagram, self.manager.constant(0))
             )
+        if self.interchangeable:
+            self.split(self.polynomial.of_rewards())
+            return
         for choice in self.process.choices:
             self.split(self.view.app(choice))
         for choice in self.process.choices:
@@ -274,6 +290,9 @@ class _Refinement:
 
     def split_all(self, value: Diagram, memo: dict[int, Diagram]) -> None:
         """Refine by the regression of `value` through every choice."""
+        if self.interchangeable:
+            self.split(self.polynomial.of_rows(value, memo))
+            return
         for number, choice in enumerate(self.process.choices):
             regressed = self.view.regress(choice, value, memo)
             if self.previous.get(number) == regressed:
@@ -330,7 +349,10 @@ class _Refinement:
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
         degree = 2 + len(self.process.channels or ())
-        return difference_bits(self.process) / 60 / PRIMES_IN_RANGE + degree / 2**60
+        bits = difference_bits(self.process)
+        if self.interchangeable:  # a product over the choices
+            degree, bits = degree * len(self.process.choices), bits * len(self.process.choices)
+        return bits / 60 / PRIMES_IN_RANGE + degree / 2**60
 
 
 def difference_bits(process: DecisionProcess) -> int:
