@@ -15,6 +15,8 @@ from factored_polca.control.polling import ask
 from factored_polca.control.tracker import Belief, ChosenTracker, OnImpossible, choose_tracker
 from factored_polca.diagrams import support
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
+from factored_polca.minimisation import Partition
+from factored_polca.models import Value
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,17 @@ def tracked_features(plan: ExecutablePomdpPlan) -> list[str]:
         for number, feature in enumerate(plan.model.features)
         if feature.observed or symbolic.now(number) in tested
     ]
+
+
+def block_state(partition: Partition, block: int) -> dict[str, Value]:
+    """The first state of a block, as far as the partition tells it: the features that it tests."""
+    symbolic, tested = partition.symbolic, support(partition.diagram)
+    first = partition.representatives[block]
+    return {
+        feature.name: feature.values[int(first[symbolic.now(number)])]
+        for number, feature in enumerate(symbolic.model.features)
+        if symbolic.now(number) in tested
+    }
 
 
 def plan_tracker(

@@ -13,26 +13,36 @@ difference of two policies varies less than each.
 
 A subtask may be run in place of the model: with its own reward, until it has ended, which its own model
 supposes to be seen (`Stage`).
+
+`run_episodes` is the loop, whatever beliefs are kept in (`Minds`); those that are not kept over blocks are
+in `belief_episodes`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from factored_polca.control.belief_policies import BlockPolicy, holds
 from factored_polca.control.block_tracker import BlockTracker
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Diagram, evaluate_states
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.models import ModelError
 from factored_polca.simulation.sampler import Sampler, States
 from factored_polca.simulation.simulate import default_steps
-from factored_polca.symbolic import Term
+from factored_polca.symbolic import SymbolicModel, Term
+
+Progress = Callable[[int, int], None]
+"""Called at each step with the number of the first episode of those that run, and the step, both from 0."""
+
+EPISODES: Final = 1000
+"""Episodes that are run where nobody asks for another number."""
 
 BELIEF_NUMBERS: Final = 1 << 23
 """Entries of the beliefs that are kept at once: more episodes are run one chunk after the other."""
@@ -56,6 +66,7 @@ class BeliefRuns:
     `returns` [episode] are discounted.  `cumulative` and `cumulative_error` [step] are the mean of what has
     been earned without discount after so many steps, and its standard error.  `counts` [action] says how
     often each action was taken; `truncation` bounds what longer episodes could change in the mean return.
+    `resets` counts beliefs that a sample had lost and that were started anew (particles only).
     """
 
     returns: FloatArray
@@ -65,6 +76,7 @@ class BeliefRuns:
     cumulative: FloatArray
     cumulative_error: FloatArray
     counts: IntArray
+    resets: int = 0
 
     @property
     def episodes(self) -> int:
@@ -88,7 +100,7 @@ def run_on_blocks(
     tracker: BlockTracker,
     policy: BlockPolicy,
     *,
-    episodes: int = 1000,
+    episodes: int = EPISODES,
     steps: int | None = None,
     seed: int = 0,
     stage: Stage | None = None,
@@ -99,31 +111,95 @@ def run_on_blocks(
         ValueError: fewer than one episode or step.
         ModelError: the policy has no action at a belief of an episode that goes on.
     """
+    symbolic = tracker.symbolic
+    stage = whole_model(symbolic) if stage is None else stage
+    kernels = _Kernels(tracker, holds(tracker, stage.ended))
+    return run_episodes(
+        World(symbolic, stage),
+        lambda count: _BlockMinds(kernels, policy, count),
+        episodes=episodes,
+        steps=steps,
+        seed=seed,
+        at_once=max(1, BELIEF_NUMBERS // tracker.partition.blocks),
+    )
+
+
+class Minds(Protocol):
+    """What the policy believes in the episodes of a chunk, and what it does; n are some of them."""
+
+    resets: int
+
+    def begin(self, mine: IntArray, states: States) -> None:
+        """Start the episodes numbered `mine` [n], whose states [n, feature] give what is seen."""
+
+    def choose(self, mine: IntArray) -> IntArray:
+        """The numbers of the primitive actions [n], -1 for none."""
+
+    def learn(self, mine: IntArray, actions: IntArray, values: IntArray, following: States) -> None:
+        """Take in what came after `actions` [n]: channels' values [n, channel], and the next states.
+
+        Of these only what is seen may be read, and that the episodes go on.
+        """
+
+
+def whole_model(symbolic: SymbolicModel) -> Stage:
+    """The model itself as a stage."""
+    return Stage(symbolic.terminal, {a: action.rewards for a, action in enumerate(symbolic.actions)})
+
+
+def run_episodes(
+    world: World,
+    minds: Callable[[int], Minds],
+    *,
+    episodes: int,
+    steps: int | None,
+    seed: int,
+    at_once: int,
+    progress: Progress | None = None,
+) -> BeliefRuns:
+    """Run episodes, at most `at_once` side by side; `minds` makes the beliefs of so many.
+
+    Raises:
+        ValueError: fewer than one episode or step.
+        ModelError: the policy has no action at a belief of an episode that goes on.
+    """
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError("episodes and steps must be at least 1")
-    symbolic = tracker.symbolic
+    symbolic = world.symbolic
     discount = float(symbolic.model.discount)
     length = default_steps(discount) if steps is None else steps
-    if stage is None:
-        stage = Stage(symbolic.terminal, {a: act.rewards for a, act in enumerate(symbolic.actions)})
-    most = max(1, BELIEF_NUMBERS // tracker.partition.blocks)
     generator = np.random.default_rng(seed)
-    world = _World(tracker, stage)
     total = _Total(length, len(symbolic.actions))
-    for first in range(0, episodes, most):
-        _run(world, policy, min(most, episodes - first), length, discount, generator, total)
+    for first in range(0, episodes, at_once):
+        count = min(at_once, episodes - first)
+        tell = None if progress is None else partial(progress, first)
+        _run(world, minds(count), count, length, discount, generator, total, tell)
     return total.runs(episodes, length, discount)
 
 
-class _World:
-    """The sampled world and the kernels over blocks, made as they are needed."""
+class World:
+    """The model that states are drawn from, unseen, until the stage has ended."""
 
-    def __init__(self, tracker: BlockTracker, stage: Stage) -> None:
-        self.tracker, self.stage = tracker, stage
-        self.sampler = Sampler(tracker.symbolic)
+    def __init__(self, symbolic: SymbolicModel, stage: Stage) -> None:
+        self.symbolic, self.stage = symbolic, stage
+        self.sampler = Sampler(symbolic)
+
+    def ended(self, states: States) -> BoolArray:
+        """Which episodes are over."""
+        return evaluate_states(self.stage.ended, states, self.symbolic.columns()).astype(np.bool_)
+
+    def rewards(self, action: int, states: States) -> FloatArray:
+        """The expected reward of an action at each state."""
+        return self.sampler.expected_rewards(self.stage.rewards[action], states)
+
+
+class _Kernels:
+    """The kernels over a tracker's blocks, made as they are needed; episodes are over in blocks `over`."""
+
+    def __init__(self, tracker: BlockTracker, over: BoolArray) -> None:
+        self.tracker, self.over = tracker, over
         self.sensed = [list(channels) for channels in tracker.reader.sensed]
         self.observed = list(tracker.reader.observed)
-        self.over = holds(tracker, stage.ended)
         self.kernels: dict[tuple[int, tuple[int, ...]], Any] = {}
         self.entries = 0
 
@@ -137,17 +213,6 @@ class _World:
             self.kernels[key] = self.tracker.rows(action, values).matrix()
             self.entries += self.kernels[key].nnz
         return self.kernels[key]
-
-    def ended(self, states: States) -> BoolArray:
-        """Which episodes are over."""
-        from factored_polca.diagrams import evaluate_states
-
-        columns = self.tracker.symbolic.columns()
-        return evaluate_states(self.stage.ended, states, columns).astype(np.bool_)
-
-    def rewards(self, action: int, states: States) -> FloatArray:
-        """The expected reward of an action at each state."""
-        return self.sampler.expected_rewards(self.stage.rewards[action], states)
 
     def begin(self, states: States) -> FloatArray:
         """Beliefs [n, block] at the start, after what is seen of `states`, which are not over."""
@@ -184,6 +249,25 @@ class _World:
         return self.narrow(result, following)
 
 
+class _BlockMinds:
+    """Beliefs over a tracker's blocks and a policy over them."""
+
+    resets = 0
+
+    def __init__(self, kernels: _Kernels, policy: BlockPolicy, count: int) -> None:
+        self.kernels, self.policy = kernels, policy
+        self.beliefs = np.zeros((count, kernels.tracker.partition.blocks))
+
+    def begin(self, mine: IntArray, states: States) -> None:
+        self.beliefs[mine] = self.kernels.begin(states)
+
+    def choose(self, mine: IntArray) -> IntArray:
+        return self.policy.choose(self.beliefs[mine])
+
+    def learn(self, mine: IntArray, actions: IntArray, values: IntArray, following: States) -> None:
+        self.beliefs[mine] = self.kernels.learn(self.beliefs[mine], actions, values, following)
+
+
 class _Total:
     """Sums over all episodes (a working state, not a value)."""
 
@@ -191,7 +275,7 @@ class _Total:
         self.returns: list[FloatArray] = []
         self.sums, self.squares = np.zeros(steps), np.zeros(steps)
         self.counts = np.zeros(actions, dtype=np.int64)
-        self.ended, self.largest = 0, 0.0
+        self.ended, self.largest, self.resets = 0, 0.0, 0
 
     def runs(self, episodes: int, steps: int, discount: float) -> BeliefRuns:
         mean = self.sums / episodes
@@ -201,29 +285,31 @@ class _Total:
             left = discount**steps / (1 - discount) * self.largest
         return BeliefRuns(
             np.concatenate(self.returns), steps, self.ended, left, mean, np.sqrt(variance / episodes),
-            self.counts,
+            self.counts, self.resets,
         )  # fmt: skip
 
 
 def _run(
-    world: _World,
-    policy: BlockPolicy,
+    world: World,
+    minds: Minds,
     count: int,
     length: int,
     discount: float,
     generator: np.random.Generator,
     total: _Total,
+    tell: Callable[[int], None] | None,
 ) -> None:
     states = world.sampler.initial(count, generator)
     running = ~world.ended(states)
-    beliefs = np.zeros((count, world.tracker.partition.blocks))
-    beliefs[running] = world.begin(states[running])
+    going = np.flatnonzero(running)
+    minds.begin(going, states[going])
     returns, cumulative, weight = np.zeros(count), np.zeros(count), 1.0
     for step in range(length):
-        going = np.flatnonzero(running)
         if len(going):
+            if tell is not None:
+                tell(step)
             actions = np.full(count, -1, dtype=np.int64)
-            actions[going] = policy.choose(beliefs[going])
+            actions[going] = minds.choose(going)
             if (actions[going] < 0).any():
                 raise ModelError("the policy has no action at a belief of an episode that goes on")
             following, _ = world.sampler.step(states, actions, generator)
@@ -236,11 +322,12 @@ def _run(
                 total.counts[action] += len(mine)
                 total.largest = max(total.largest, float(np.abs(rewards).max()))
             running &= ~world.ended(following)
-            on = np.flatnonzero(running)
-            if len(on) and step + 1 < length:
-                beliefs[on] = world.learn(beliefs[on], actions[on], values[on], following[on])
+            going = np.flatnonzero(running)
+            if len(going) and step + 1 < length:
+                minds.learn(going, actions[going], values[going], following[going])
             states, weight = following, weight * discount
         total.sums[step] += cumulative.sum()
         total.squares[step] += (cumulative**2).sum()
     total.returns.append(returns)
     total.ended += int((~running).sum())
+    total.resets += minds.resets

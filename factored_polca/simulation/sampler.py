@@ -28,11 +28,17 @@ class Sampler:
         self._columns = symbolic.columns()
         self._cumulative: dict[int, FloatArray] = {}
 
-    def initial(self, episodes: int, generator: np.random.Generator) -> States:
-        """States drawn from b0 [episode, feature]."""
+    def initial(
+        self,
+        episodes: int,
+        generator: np.random.Generator,
+        rows: Mapping[int, RowDiagram] | None = None,
+    ) -> States:
+        """States drawn from b0, or from another belief given as `rows` [episode, feature]."""
         count = len(self.symbolic.model.features)
         nowhere = np.zeros((episodes, count), dtype=np.int32)
-        return self._draw(nowhere, self.symbolic.initial, _parents_first(self.symbolic.initial), generator)
+        rows = self.symbolic.initial if rows is None else rows
+        return self._draw(nowhere, rows, _parents_first(rows), generator)
 
     def step(
         self, states: States, actions: npt.NDArray[np.int64], generator: np.random.Generator
