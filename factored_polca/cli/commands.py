@@ -1,4 +1,4 @@
-"""The commands that minimise and execute: minimise, act, simulate."""
+"""The command `minimise`, and what the commands that work on models share."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
-from factored_polca.cli.source import Source, UsageError, load, parse_actions, parse_state
+from factored_polca.cli.source import Source, UsageError, load, parse_actions
 from factored_polca.formats import destination
 from factored_polca.models import LimitReached
-
-if TYPE_CHECKING:
-    from factored_polca.simulation import Simulation
 
 ACTIONS_SHOWN = 30
 """Actions in a table before the rest is summed up."""
@@ -212,91 +207,3 @@ def refuse_unwritable(path: str) -> None:
     folder = destination(path).parent
     if not os.access(folder, os.W_OK):
         raise UsageError(f"{path}: the folder {folder} can't be written to")
-
-
-def act(arguments: argparse.Namespace, output: Output) -> int:
-    """Say what a plan does in a state."""
-    from factored_polca.control import Controller
-    from factored_polca.hierarchy.plan_file import load_plan
-
-    plan = load_plan(arguments.plan)
-    state = parse_state(arguments.state, plan.model)
-    decision = Controller(plan).poll(state)
-    path = [
-        {
-            "task": poll.task,
-            "block": poll.block,
-            "block_states": poll.block_states,
-            "action": poll.action,
-            "terminal": poll.terminal,
-        }
-        for poll in decision.path
-    ]
-    data = {"action": decision.action, "path": path}
-    if arguments.json:
-        output.result(data)
-        return 0
-    table = make_table(
-        "polled from the top", {"task": "left", "block": "right", "states in it": "right", "answer": "left"}
-    )
-    for poll in decision.path:
-        without = "the task has ended" if poll.terminal else "no action: a dead end"
-        if poll.block is None:
-            without = "no action: outside the states that were planned for (--reachable)"
-        answer = poll.action or without
-        block = "none" if poll.block is None else f"{poll.block:,}"
-        table.add_row(escape(poll.task), block, big(poll.block_states), escape(answer))
-    output.table(table)
-    output.line(f"action: [bold]{escape(decision.action or 'none')}[/]")
-    return 0
-
-
-def simulate(arguments: argparse.Namespace, output: Output) -> int:
-    """Run a plan or a policy on the original model."""
-    from factored_polca.hierarchy.plan_file import load_plan
-    from factored_polca.hierarchy.policy_file import is_policy_file, load_policy
-    from factored_polca.simulation import simulate as run
-    from factored_polca.simulation import simulate_policy
-
-    file, asked = arguments.plan, {"episodes": arguments.episodes, "steps": arguments.steps}
-    planned: dict[str, Any]
-    perform: Callable[..., Simulation]
-    if is_policy_file(file):
-        policy = load_policy(file)
-        perform = partial(simulate_policy, policy.flat.pomdp, policy.policy)
-        planned = {f"planned_{name}": policy.report.get(name) for name in ("value", "lower", "upper")}
-    else:
-        plan = load_plan(file)
-        perform, planned = partial(run, plan), {"planned_value": plan.report.get("value")}
-    with output.progress(f"simulating {arguments.episodes:,} episodes"):
-        result = perform(**asked, seed=arguments.seed)
-    data = {
-        "mean": result.mean,
-        "standard_error": result.standard_error,
-        "episodes": result.episodes,
-        "steps": result.steps,
-        "ended": result.ended,
-        "truncation": result.truncation,
-        **planned,
-        "seed": arguments.seed,
-    }
-    if arguments.json:
-        output.result(data)
-    else:
-        print_simulation(data, output)
-    return 0
-
-
-def print_simulation(data: dict[str, Any], output: Output) -> None:
-    """The figures of `simulate` for people."""
-    output.line(
-        f"mean return [bold]{data['mean']:.6g}[/] ± {data['standard_error']:.2g} (standard error, "
-        f"{data['episodes']:,} episodes of at most {data['steps']:,} steps, {data['ended']:,} ended)"
-    )
-    value, lower, upper = (data.get(f"planned_{name}") for name in ("value", "lower", "upper"))
-    if isinstance(value, (int, float)):
-        bounded = isinstance(lower, (int, float)) and isinstance(upper, (int, float))
-        bounds = f", the bounds {lower:.6g} .. {upper:.6g}" if bounded else ""
-        output.line(f"planned value: {value:.6g}{bounds}")
-    if data["truncation"] > max(data["standard_error"], 1e-6 * abs(data["mean"])):
-        output.line(f"cut off: longer episodes may change the mean by up to {data['truncation']:.2g}")

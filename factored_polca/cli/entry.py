@@ -47,6 +47,19 @@ the result so far printed and written if there is one; 3 where memory or another
 """
 
 
+RUN_NOTES = """at each step type what was observed, for example
+  Speech=yes          a channel, or a feature that is seen, and its value
+  yes                 the same, where one of them has that value
+  (an empty line)     nothing, or none from every channel
+  ?                   what may be observed, with probabilities
+  back                take the last step back
+  ended               the episode has ended
+  quit                leave; the end of the input does the same
+
+Lines may come from a pipe.  With --json the dialogue is on stderr, and one object on stdout at the end.
+"""
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser of the command line."""
     top = argparse.ArgumentParser(
@@ -127,12 +140,27 @@ def parser() -> argparse.ArgumentParser:
     sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
     with_model(sub)
     add_solving(sub)
-    sub = command("act", "Say what a plan does in a state, and why.")
+    sub = command("act", "Say what a plan does in a state, or at a belief, and why.")
     sub.add_argument("plan", metavar="PLAN")
-    sub.add_argument("--state", required=True, metavar="x=3,y=2,...", help="a value for each feature")
+    sub.add_argument("--state", metavar="x=3,y=2,...", help="a value for each feature")
+    sub.add_argument("--belief", metavar="SPEC", help=BELIEF)
+    sub = command("run", "Run a plan step by step where the state is not seen: you say what is observed.")
+    sub.epilog, sub.formatter_class = RUN_NOTES, argparse.RawDescriptionHelpFormatter
+    sub.add_argument("plan", metavar="PLAN")
+    sub.add_argument("--belief", metavar="SPEC", help=BELIEF)
+    sub.add_argument(
+        "--steps", type=counting, metavar="N", help="no more than N steps; with --auto 20 if not given"
+    )
+    sub.add_argument("--auto", action="store_true", help="observations are drawn from the model, unseen")
+    sub.add_argument("--seed", type=natural, metavar="S", help="seed of what --auto draws (0)")
     sub = command("simulate", "Run a plan, or a policy that solve found, on the original model.")
     sub.add_argument("plan", metavar="FILE", help="a plan or a policy")
-    sub.add_argument("--episodes", type=counting, default=1000, metavar="N", help="1000 if not given")
+    sub.add_argument(
+        "--episodes",
+        type=counting,
+        metavar="N",
+        help="1000 if not given; 100 where beliefs are not over blocks",
+    )
     sub.add_argument(
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
@@ -162,6 +190,10 @@ def add_solving(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-o", "--output", metavar="POLICY", help="write the policy to a file")
 
 
+BELIEF = (
+    "where the state is not seen: features, independent, with their probabilities, such as "
+    "battery=low,person=room:0.9/physio:1/10; others as at the start, as all are if it is not given"
+)
 TRIALS = 100
 ORDERS = ("auto", "file", "force", "spectral")
 FLAT_SOLVERS = (
@@ -238,13 +270,13 @@ def discount(text: str) -> Fraction:
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
+    from factored_polca.cli import act, models, plan, run, simulate, solve
     from factored_polca.cli import commands as work
-    from factored_polca.cli import models, plan, solve
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
-        "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": work.act,
-        "simulate": work.simulate, "solve": solve.solve,
+        "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
+        "run": run.run, "simulate": simulate.simulate, "solve": solve.solve,
     }  # fmt: skip
 
 

@@ -93,8 +93,12 @@ def escape(text: str) -> str:
 
     Names in model files are other people's; they must not move the cursor or change the colours.
     """
-    shown = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
-    return markup.escape(shown)
+    return markup.escape(printable(text))
+
+
+def printable(text: str) -> str:
+    """The same for text that is printed without markup."""
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 @contextmanager

@@ -7,11 +7,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 from factored_polca import library
 from factored_polca.formats import FORMATS, read
-from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, Value
+from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, Value
 
 
 class UsageError(Exception):
@@ -125,33 +126,105 @@ def parse_state(text: str, model: Model) -> dict[str, Value]:
     Raises:
         ModelError: an unknown feature or value, or a feature without one.
     """
-    if text.count('"') % 2:
-        raise ModelError(f"--state takes FEATURE=VALUE,...; a quote is not closed in {text!r}")
-    state: dict[str, Value] = {}
-    for part in re.findall(r'(?:"[^"]*"|[^,"])+|^$', text):
-        match = re.fullmatch(r'\s*("[^"]*"|[^"=]*?)\s*=\s*("[^"]*"|[^"]*?)\s*', part)
-        if match is None:
-            raise ModelError(f"--state takes FEATURE=VALUE,..., not {part!r}")
-        name, value = match[1].strip('"'), match[2]
-        try:
-            feature = model.feature(name)
-        except KeyError as error:
-            raise ModelError(str(error.args[0])) from None
-        if name in state:
-            raise ModelError(f"--state gives {name} twice")
-        if value.startswith('"'):
-            value = value[1:-1]
-            by_text: Mapping[str, Value] = {v: v for v in feature.values if isinstance(v, str)}
-        else:
-            by_text = value_texts(feature.values)
-        if value not in by_text:
-            listed = ", ".join(list(by_text)[:20])
-            raise ModelError(f"{name} has no value {value!r}; it has {listed}")
-        state[name] = by_text[value]
+    state = {
+        feature.name: parse_value(feature.name, feature.values, value)
+        for feature, value in assignments(text, "--state", "FEATURE=VALUE,...", model)
+    }
     missing = [feature.name for feature in model.features if feature.name not in state]
     if missing:
         raise ModelError(f"--state gives no value for {', '.join(missing)}")
     return state
+
+
+_SHARE = re.compile(r"""\s*("[^"]*"|[^":/]*?)\s*:([^":/]*(?:/[^":/]*)?)(?=$|/\s*(?:"[^"]*"|[^":/]*):)/?""")
+"""VALUE:P, and the slash before the next one; P may have a slash itself."""
+
+_NUMBER = re.compile(r"[0-9]{1,30}(\.[0-9]{0,30})?|\.[0-9]{1,30}|[0-9]{1,30}/[0-9]{0,29}[1-9][0-9]{0,29}")
+
+
+def parse_belief(text: str, model: Model) -> dict[str, dict[Value, Fraction]]:
+    """`battery=low,person=room:0.9/physio:0.1` as {feature: {value: probability}}.
+
+    Probabilities are decimals or fractions such as 1/3; a value without one is certain.  Quotes work as
+    in `parse_state`; a value with a colon or a slash needs them.
+
+    Raises:
+        ModelError: an unknown feature or value, no number, a feature or value given twice, or
+            probabilities that do not sum to exactly 1.
+    """
+    form = "FEATURE=VALUE or FEATURE=VALUE:P/VALUE:P,..."
+    return {
+        feature.name: _distribution(feature, chances, form)
+        for feature, chances in assignments(text, "--belief", form, model)
+    }
+
+
+def _distribution(feature: Feature, text: str, form: str) -> dict[Value, Fraction]:
+    name, row, place = feature.name, dict[Value, Fraction](), 0
+    if ":" not in text or text in value_texts(feature.values) or re.fullmatch('"[^"]*"', text):
+        return {parse_value(name, feature.values, text): Fraction(1)}
+    while place < len(text):
+        match = _SHARE.match(text, place)
+        if match is None:
+            raise ModelError(f"--belief takes {form}, not {name}={text!r}")
+        value, number, place = match[1], match[2].strip(), match.end()
+        key = parse_value(name, feature.values, value)
+        if not _NUMBER.fullmatch(number):
+            raise ModelError(
+                f"--belief: {number[:40]!r} is no probability of {name}={value}, such as 0.25 or 1/4"
+            )
+        if key in row:
+            raise ModelError(f"--belief gives {name}={value} twice")
+        row[key] = Fraction(number)
+    total = sum(row.values())
+    if total != 1:
+        raise ModelError(
+            f"--belief: the probabilities of {name} sum to {str(total)[:60]}, not to 1; numbers are read "
+            "exactly, and a third is 1/3"
+        )
+    return row
+
+
+def assignments(text: str, option: str, form: str, model: Model) -> Iterator[tuple[Feature, str]]:
+    """The parts of `x=3,y=on`: each feature, once, and what is written for it.
+
+    Raises:
+        ModelError: not of that form, an unknown feature, or one given twice.
+    """
+    if text.count('"') % 2:
+        raise ModelError(f"{option} takes {form}; a quote is not closed in {text!r}")
+    given = set[str]()
+    for part in re.findall(r'(?:"[^"]*"|[^,"])+|^$', text):
+        match = re.fullmatch(r'\s*("[^"]*"|[^"=]*?)\s*=\s*(.*?)\s*', part, re.DOTALL)
+        if match is None:
+            raise ModelError(f"{option} takes {form}, not {part!r}")
+        name = match[1].strip('"')
+        try:
+            feature = model.feature(name)
+        except KeyError as error:
+            raise ModelError(str(error.args[0])) from None
+        if name in given:
+            raise ModelError(f"{option} gives {name} twice")
+        given.add(name)
+        yield feature, match[2]
+
+
+def parse_value(name: str, values: Sequence[Value], text: str) -> Value:
+    """The value of a feature or channel that a person wrote; in quotes it is a name.
+
+    Raises:
+        ModelError: there is none; the message lists those there are.
+    """
+    by_text: Mapping[str, Value]
+    if re.fullmatch(r'"[^"]*"', text):
+        text = text[1:-1]
+        by_text = {v: v for v in values if isinstance(v, str)}
+    else:
+        by_text = value_texts(values)
+    if text not in by_text:
+        listed = ", ".join(list(by_text)[:20])
+        raise ModelError(f"{name} has no value {text!r}; it has {listed}")
+    return by_text[text]
 
 
 def value_texts(values: Sequence[Value]) -> Mapping[str, Value]:

@@ -26,7 +26,7 @@ class Sampler:
     def __init__(self, symbolic: SymbolicModel) -> None:
         self.symbolic = symbolic
         self._columns = symbolic.columns()
-        self._cumulative: dict[int, FloatArray] = {}
+        self._cumulative: dict[int, tuple[RowDiagram, FloatArray]] = {}  # the row, which keeps its id
 
     def initial(
         self,
@@ -116,8 +116,8 @@ class Sampler:
             for number, probabilities in enumerate(row.rows):
                 last = max(v for v, q in enumerate(probabilities) if q)
                 table[number, last:] = np.inf
-            self._cumulative[key] = table
-        return self._cumulative[key]
+            self._cumulative[key] = (row, table)
+        return self._cumulative[key][1]
 
     def _rewards(self, terms: Sequence[Term], states: States, following: States) -> FloatArray:
         pairs = np.concatenate([states, following], axis=1)
