@@ -118,7 +118,7 @@ def parse(text: str, asked: Asked) -> tuple[dict[str, Value], bool]:
         if match is None:
             plain.append(word)
             continue
-        name = match[1].strip('"')
+        name = channel_name(match[1], asked)
         values = asked.values.get(name, asked.others.get(name))
         if values is None:
             raise Misread(f"{name!r} is not observed here; what is: {allowed(asked)}")
@@ -141,6 +141,15 @@ def parse(text: str, asked: Asked) -> tuple[dict[str, Value], bool]:
         else:
             raise Misread(f"{word!r} is not observed here; what is: {allowed(asked)}")
     return given, ended
+
+
+def channel_name(text: str, asked: Asked) -> str:
+    """The name that is written so, capitals aside where that leaves no doubt."""
+    names = [*asked.values, *asked.others]
+    if text.startswith('"') or text in names:
+        return text.strip('"')
+    alike = [name for name in names if name.casefold() == text.casefold()]
+    return alike[0] if len(alike) == 1 else text
 
 
 def put(given: dict[str, Value], name: str, value: Value) -> None:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import sys
 import textwrap
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from factored_polca.cli.commands import compile_kernels
+from factored_polca.cli.episode import SHOWN_VALUES, Episode, Step
 from factored_polca.cli.output import Output, big, escape, printable
 from factored_polca.cli.pilot import (
     LIKELIEST,
@@ -32,10 +31,11 @@ from factored_polca.cli.pilot import (
     seen_at_start,
     tracker_of,
 )
-from factored_polca.cli.replies import Asked, Misread, allowed, asked_after, read_reply
+from factored_polca.cli.replies import Asked, Misread, allowed, asked_after, listing, read_reply
 from factored_polca.cli.source import UsageError, parse_belief
 from factored_polca.control.answers import answers, can_end
-from factored_polca.control.tracker import Belief, Rows
+from factored_polca.control.received import shown
+from factored_polca.control.tracker import Belief, Rows, Tracker
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.hierarchy.executable import ExecutablePlan
 from factored_polca.models import ModelError, Value
@@ -44,28 +44,16 @@ from factored_polca.simulation.sampler import Sampler
 AUTO_STEPS: Final = 20
 """Steps of an episode that is simulated, where nobody asks for more."""
 
-SHOWN_VALUES: Final = 4
-"""Values of a feature that are printed, the likeliest ones."""
-
 SHOWN_FEATURES: Final = 15
 """Features of which more than one value is printed."""
 
 SHOWN_ANSWERS: Final = 30
 """Answers that `?` lists."""
 
+LISTED_VALUES: Final = 8
+"""Values of a channel up to which the prompt lists them."""
+
 HELP: Final = "back takes the last step back, quit ends the dialogue"
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step: the belief before it, what was done, and what came of it (None: not known yet)."""
-
-    belief: Belief
-    said: Said
-    observation: dict[str, Value] | None = None
-    ended: bool = False
-    likelihood: float | None = None
-    reward: float | None = None
 
 
 class Quit(Exception):
@@ -87,27 +75,26 @@ def run(arguments: argparse.Namespace, output: Output) -> int:
     compile_kernels(output)
     with output.progress("making a tracker of beliefs"):
         chosen = tracker_of(plan, "reset" if arguments.auto else "error", arguments.seed or 0)
-    episode = Episode(plan, chosen.tracker, rows_of(plan, given), Talk(output))
-    episode.open(chosen.kind)
+    session = Session(plan, chosen.tracker, rows_of(plan, given), Talk(output))
     status = 0
     try:
         if arguments.auto:
-            episode.simulate(arguments.steps or AUTO_STEPS, arguments.seed or 0)
+            session.simulate(arguments.steps or AUTO_STEPS, arguments.seed or 0)
         else:
-            episode.hold(arguments.steps)
+            session.hold(arguments.steps)
     except Quit:
         pass
     except KeyboardInterrupt:
-        episode.talk.line()
+        session.talk.line()
         status = 130
-    episode.close(arguments.auto)
+    session.close(arguments.auto)
     if arguments.json:
         output.result(
             {
                 "model": plan.model.name,
                 "tracker": chosen.kind,
                 "tracker_reason": chosen.reason,
-                **episode.data(arguments.auto),
+                **session.episode.data(session.decide, rewarded=arguments.auto),
             }
         )
     return status
@@ -135,7 +122,10 @@ class Talk:
     def indented(self, text: str) -> None:
         """Print escaped text, wrapped to the terminal, under a step."""
         width = max(40, self.console.width)
-        for part in textwrap.wrap(text, width, initial_indent="    ", subsequent_indent="      "):
+        for part in textwrap.wrap(
+            text, width, initial_indent="    ", subsequent_indent="      ",
+            break_long_words=False, break_on_hyphens=False,
+        ):  # fmt: skip
             self.line(part)
 
     def ask(self, prompt: str) -> str:
@@ -152,21 +142,20 @@ class Talk:
                 raise Quit from None
         found = sys.stdin.readline() if sys.stdin is not None else ""
         if not self.silent:
-            self.console.print(escape(prompt + found.rstrip("\n")), soft_wrap=True)
+            self.console.print(escape(prompt + found.rstrip("\r\n")), soft_wrap=True)
         if not found:
             raise Quit
         return found
 
 
-class Episode:
-    """The steps of an episode so far (a working state, not a value)."""
+class Session:
+    """An episode and who observes it (a working state, not a value)."""
 
-    def __init__(self, plan: AnyPlan, tracker: Any, rows: Rows, talk: Talk) -> None:
+    def __init__(self, plan: AnyPlan, tracker: Tracker, rows: Rows, talk: Talk) -> None:
         self.plan, self.tracker, self.rows, self.talk = plan, tracker, rows, talk
         self.symbolic, self.model = plan.symbolic, plan.model
-        self.decide, self.features = decider(plan), features_of(plan)
-        self.steps: list[Step] = []
-        self.belief: Belief | None = None
+        self.decide = decider(plan)
+        self.episode = Episode(plan.model, tuple(features_of(plan)))
 
     # -- the two ways -----------------------------------------------------------------------------
 
@@ -177,8 +166,9 @@ class Episode:
             Quit: asked for, or no further line.
         """
         belief = self.start_by_person()
-        while not belief.ended and (limit is None or len(self.steps) < limit):
-            self.belief = belief
+        self.open()
+        while not belief.ended and (limit is None or len(self.episode.steps) < limit):
+            self.episode.belief = belief
             said = self.decide(belief)
             self.show(belief, said)
             if said.action is None:
@@ -186,21 +176,22 @@ class Episode:
             try:
                 step = self.observe(belief, said)
             except Back:
-                if self.steps:
-                    belief = self.steps.pop().belief
+                if self.episode.steps:
+                    belief = self.episode.steps.pop().belief
                 else:
                     self.talk.line("    there is no step to take back")
                 continue
             belief = self.keep(*step)
-        self.belief = belief
+        self.episode.belief = belief
 
     def simulate(self, steps: int, seed: int) -> None:
         """Let a world that is drawn, unseen by the plan, observe."""
         sampler, generator = Sampler(self.symbolic), np.random.default_rng(seed)
         state = sampler.initial(1, generator, self.rows)
         belief = self.start(self.seen(state), bool(sampler.terminal(state)[0]))
-        while not belief.ended and len(self.steps) < steps:
-            self.belief = belief
+        self.open()
+        while not belief.ended and len(self.episode.steps) < steps:
+            self.episode.belief = belief
             said = self.decide(belief)
             self.show(belief, said)
             if said.action is None:
@@ -214,7 +205,7 @@ class Episode:
             after = belief.after(said.number, observation, ended=bool(sampler.terminal(following)[0]))
             step = Step(belief, said, observation, after.ended, after.likelihood, float(rewards[0]))
             belief, state = self.keep(step, after), following
-        self.belief = belief
+        self.episode.belief = belief
 
     def seen(self, state: Any) -> dict[str, Value]:
         """The values of the observed features of a drawn state."""
@@ -223,7 +214,7 @@ class Episode:
 
     def keep(self, step: Step, after: Belief) -> Belief:
         """Note a step and say what came of it; answer the belief after it."""
-        self.steps.append(step)
+        self.episode.steps.append(step)
         observed = assigned(step.observation or {}) or "nothing"
         observed += ", and the episode has ended" if step.ended else ""
         likelihood = 0.0 if step.likelihood is None else step.likelihood
@@ -242,10 +233,9 @@ class Episode:
             UsageError: it is impossible.
         """
         try:
-            begun: Belief = self.tracker.start(seen, ended=ended, initial=self.rows)
+            return self.tracker.start(seen, ended=ended, initial=self.rows)
         except ImpossibleObservation as error:
             raise UsageError(str(error)) from None
-        return begun
 
     def start_by_person(self) -> Belief:
         """The belief at the start; what is seen there and not certain is asked for."""
@@ -258,10 +248,8 @@ class Episode:
             try:
                 if self.is_command(line, lambda: allowed(asked)):
                     continue
-                begun: Belief = self.tracker.start(
-                    seen | read_reply(line, asked, lambda: None).observation, initial=self.rows
-                )
-                return begun
+                read = read_reply(line, asked, lambda: None).observation
+                return self.tracker.start(seen | read, initial=self.rows)
             except Back:
                 self.talk.line("    there is no step to take back")
             except (Misread, ModelError, ImpossibleObservation) as error:
@@ -329,10 +317,10 @@ class Episode:
 
     # -- what is printed --------------------------------------------------------------------------
 
-    def open(self, kind: str) -> None:
+    def open(self) -> None:
         """What is run, and how."""
-        model = self.model
-        self.talk.line(f"{escape(model.name)}, {big(model.states)} states; beliefs tracked: {kind}")
+        name, states, kind = escape(self.model.name), big(self.model.states), self.tracker.kind
+        self.talk.line(f"{name}, {states} states; beliefs tracked: {kind}")
         if isinstance(self.plan, ExecutablePlan):
             self.talk.line(LIKELIEST)
 
@@ -342,10 +330,10 @@ class Episode:
         action = escape(said.action or "no action: the task at the top has ended everywhere that may be")
         ahead = " (by looking ahead)" if any(poll.get("looked_ahead") for poll in said.path) else ""
         self.talk.line()
-        self.talk.line(f"[bold]{len(self.steps) + 1}. {action}[/]   {path}{ahead}")
+        self.talk.line(f"[bold]{len(self.episode.steps) + 1}. {action}[/]   {path}{ahead}")
         if said.state is not None:
             self.talk.indented(f"likeliest: {assigned(said.state)}")
-        sure, unsure = self.hypotheses(belief)
+        sure, unsure = self.episode.hypotheses(belief)
         if sure:
             self.talk.indented(f"sure: {assigned(sure)}")
         width = max((len(name) for name, _ in unsure), default=0)
@@ -356,84 +344,18 @@ class Episode:
         if len(unsure) > SHOWN_FEATURES:
             self.talk.indented(f"and {len(unsure) - SHOWN_FEATURES:,} more features that are not sure")
 
-    def hypotheses(
-        self, belief: Belief
-    ) -> tuple[dict[str, Value], list[tuple[str, list[tuple[Value, float]]]]]:
-        """Tracked features whose value is certain, and the values of the others, likeliest first."""
-        sure, unsure = dict[str, Value](), list[tuple[str, list[tuple[Value, float]]]]()
-        for name, chances in belief.marginals().items():
-            if name not in self.features:
-                continue
-            order = np.argsort(-chances, kind="stable")
-            values = self.model.feature(name).values
-            found = [(values[v], float(chances[v])) for v in order.tolist() if chances[v] > 0]
-            if found[0][1] > 1 - 1e-12:
-                sure[name] = found[0][0]
-            else:
-                unsure.append((name, found))
-        return sure, unsure
-
     def close(self, auto: bool) -> None:
         """How it went."""
-        done = f"{len(self.steps):,} step{'' if len(self.steps) == 1 else 's'}"
-        if self.belief is not None and self.belief.ended:
+        done = f"{len(self.episode.steps):,} step{'' if len(self.episode.steps) == 1 else 's'}"
+        if self.episode.ended:
             done += "; the episode has ended"
         self.talk.line()
-        self.talk.line(f"{done}; log-likelihood of what was observed {self.log_likelihood():.6g}")
+        self.talk.line(f"{done}; log-likelihood of what was observed {self.episode.log_likelihood():.6g}")
         if auto:
             self.talk.line(
-                f"earned {self.earned(discounted=False):g}, discounted {self.earned(discounted=True):.6g}"
+                f"earned {self.episode.earned(1.0):g}, "
+                f"discounted {self.episode.earned(float(self.model.discount)):.6g}"
             )
-
-    # -- figures ----------------------------------------------------------------------------------
-
-    def log_likelihood(self) -> float:
-        """The natural logarithm of the probability of all that was observed, given the actions."""
-        chances = [step.likelihood or 0.0 for step in self.steps]
-        return sum(math.log(q) if q > 0 else -math.inf for q in chances)
-
-    def earned(self, *, discounted: bool) -> float:
-        """The sum of the rewards."""
-        discount = float(self.model.discount) if discounted else 1.0
-        return math.fsum(discount**t * (step.reward or 0.0) for t, step in enumerate(self.steps))
-
-    def data(self, auto: bool) -> dict[str, Any]:
-        """The episode as plain data; the last step has no observation where none came."""
-        steps = list(self.steps)
-        if self.belief is not None and not self.belief.ended:
-            steps.append(Step(self.belief, self.decide(self.belief)))
-        result: dict[str, Any] = {
-            "steps": [self.step_data(step, auto) for step in steps],
-            "ended": self.belief is not None and self.belief.ended,
-            "log_likelihood": self.log_likelihood(),
-        }
-        if auto:
-            result["return"] = self.earned(discounted=True)
-            result["undiscounted_return"] = self.earned(discounted=False)
-        return result
-
-    def step_data(self, step: Step, auto: bool) -> dict[str, Any]:
-        """A step as plain data; beliefs are those before it."""
-        sure, unsure = self.hypotheses(step.belief)
-        known = {name: [(value, 1.0)] for name, value in sure.items()} | dict(unsure)
-        beliefs = {
-            name: [{"value": value, "probability": q} for value, q in known[name][:SHOWN_VALUES]]
-            for name in self.features
-            if name in known
-        }
-        data: dict[str, Any] = {
-            "action": step.said.action,
-            "path": step.said.path,
-            "beliefs": beliefs,
-            "observation": step.observation,
-            "ended": step.ended,
-            "likelihood": step.likelihood,
-        }
-        if step.said.state is not None:
-            data["likeliest_state"] = dict(step.said.state)
-        if auto:
-            data["reward"] = step.reward
-        return data
 
 
 def surely_ended(belief: Belief, action: int, observation: Mapping[str, Value]) -> bool:
@@ -447,8 +369,6 @@ def surely_ended(belief: Belief, action: int, observation: Mapping[str, Value]) 
 
 def escape_value(value: Value) -> str:
     """A value as it is to be seen."""
-    from factored_polca.control.received import shown
-
     return escape(shown(value))
 
 
@@ -458,8 +378,5 @@ def prompt(asked: Asked) -> str:
         return "nothing is sensed, Enter goes on> "
     told = []
     for name, values in asked.values.items():
-        few = len(values) <= 8
-        from factored_polca.cli.replies import listing
-
-        told.append(f"{name} ({listing(values)})" if few else name)
+        told.append(f"{name} ({listing(values)})" if len(values) <= LISTED_VALUES else name)
     return f"{', '.join(told)}> "
