@@ -232,8 +232,10 @@ def test_where_the_policy_has_no_action_the_likeliest_action_is_taken() -> None:
 
 
 def test_a_policy_that_divides_a_block_is_refused() -> None:
-    plan = planned_as_seen("finish")
+    plan = planned_as_seen("corridor")
     tracker = make_block_tracker(plan.symbolic)
-    assert tracker.partition.blocks < likeliest_tracker(plan).tracker.partition.blocks  # type: ignore[attr-defined]
+    assert tracker.partition.blocks == 2  # the lamp; the place is never sensed
     with pytest.raises(ModelError, match="divides a block"):
-        LikeliestController(plan).poll(tracker.start({"place": 0}))
+        LikeliestController(plan).poll(tracker.start({}))
+    with pytest.raises(ModelError, match="divides a block"):
+        MostLikelyPolicy(plan.policy, tracker)
