@@ -42,13 +42,13 @@ def assert_near(runs: BeliefRuns, value: float) -> None:
 def test_tiger_earns_its_optimum() -> None:
     tiger = library.load("tiger").model
     found = plan_pomdp(tiger, flat_task(tiger), Options(gap=1e-3, flat_block_limit=None))
-    runs = root_runs(executable_pomdp(found), episodes=10_000, seed=1)
+    runs = root_runs(executable_pomdp(found), episodes=3000, seed=1)
     assert_near(runs, 19.3714)
-    assert runs.standard_error < 0.5
+    assert runs.standard_error < 0.6
 
 
 @pytest.mark.parametrize(
-    ("name", "steps"), [("tiger", 12), ("meds", 12), ("cheese_taxi", 10), ("corridor", 9), ("finish", 9)]
+    ("name", "steps"), [("tiger", 12), ("meds", 12), ("cheese_taxi", 10), ("corridor", 9), ("finish", 6)]
 )
 def test_what_is_earned_is_what_all_reachable_beliefs_earn(name: str, steps: int) -> None:
     plan = planned(name)

@@ -88,7 +88,9 @@ def read_reply(text: str, asked: Asked, possible: Possible) -> Reply:
         return Reply({**fitting[0].observation, **given}, ended)
     filled = {**{name: asked.nulls[name] for name in missing if name in asked.nulls}, **given}
     if not fitting:
-        return Reply(filled, ended)
+        raise Misread(
+            "that is impossible from this belief, whatever else was observed; ? lists what may be"
+        )
     quiet = [a for a in fitting if agrees(a, filled)]
     if len(quiet) == 1:
         return Reply({**quiet[0].observation, **filled}, ended)
