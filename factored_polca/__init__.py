@@ -11,13 +11,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from factored_polca.control import Controller, Decision, Poll
+    from factored_polca.control import (
+        Belief,
+        Controller,
+        Decision,
+        Poll,
+        choose_tracker,
+        independent_belief,
+    )
+    from factored_polca.control.belief_controller import BeliefController, BeliefDecision, plan_tracker
     from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit
     from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
     from factored_polca.formats import Document, read, write
     from factored_polca.hierarchy import HierarchicalPlan, Options, SolvedTask, plan
     from factored_polca.hierarchy.executable import ExecutablePlan, executable
     from factored_polca.hierarchy.plan_file import load_plan, save_plan
+    from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
+    from factored_polca.hierarchy.pomdp_plan_file import load_pomdp_plan, save_pomdp_plan
     from factored_polca.hierarchy.report import plan_report
     from factored_polca.library import domains
     from factored_polca.library import load as load_domain
@@ -51,6 +61,8 @@ if TYPE_CHECKING:
         uniform,
     )
     from factored_polca.simulation import Simulation, simulate
+    from factored_polca.simulation.belief_runs import BeliefRuns
+    from factored_polca.simulation.measure import Measurement, measure
     from factored_polca.solvers import MDPSolution, solve_mdp
     from factored_polca.solvers.pomdp_choose import solve_pomdp
     from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
@@ -59,13 +71,16 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME: Final = {
-    "control": ("Controller", "Decision", "Poll"),
+    "control": ("Belief", "Controller", "Decision", "Poll", "choose_tracker", "independent_belief"),
+    "control.belief_controller": ("BeliefController", "BeliefDecision", "plan_tracker"),
     "diagrams": ("Aborted", "Diagram", "Manager", "MemoryLimit"),
     "explicit.pomdp_arrays": ("ArrayPOMDP", "array_pomdp"),
     "formats": ("Document", "read", "write"),
     "hierarchy": ("HierarchicalPlan", "Options", "SolvedTask", "plan"),
     "hierarchy.executable": ("ExecutablePlan", "executable"),
     "hierarchy.plan_file": ("load_plan", "save_plan"),
+    "hierarchy.pomdp_executable": ("ExecutablePomdpPlan", "executable_pomdp"),
+    "hierarchy.pomdp_plan_file": ("load_pomdp_plan", "save_pomdp_plan"),
     "hierarchy.report": ("plan_report",),
     "library": ("domains", "load_domain"),
     "minimisation": (
@@ -77,6 +92,8 @@ _HOME: Final = {
         "Task", "TaskHierarchy", "boolean", "check", "check_tasks", "conditional", "lottery", "uniform",
     ),
     "simulation": ("Simulation", "simulate"),
+    "simulation.belief_runs": ("BeliefRuns",),
+    "simulation.measure": ("Measurement", "measure"),
     "solvers": ("MDPSolution", "solve_mdp"),
     "solvers.pomdp_choose": ("solve_pomdp",),
     "solvers.pomdp_result": ("Demand", "POMDPSolution"),
@@ -90,14 +107,17 @@ _OWN_NAME: Final = {"load_domain": "load"}
 _MODULE: Final = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
-    "Aborted", "Action", "ArrayPOMDP", "Certificate", "Controller", "Decision", "Demand", "Diagram",
-    "Document", "ExecutablePlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
-    "MDPSolution", "Manager", "MemoryLimit", "Minimisation", "Model", "ModelError", "Observation",
-    "Options", "POMDPSolution", "Partition", "Poll", "Reduction", "Simulation", "SolvedTask",
+    "Aborted", "Action", "ArrayPOMDP", "Belief", "BeliefController", "BeliefDecision", "BeliefRuns",
+    "Certificate", "Controller", "Decision", "Demand", "Diagram", "Document", "ExecutablePlan",
+    "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
+    "MDPSolution", "Manager", "Measurement", "MemoryLimit", "Minimisation", "Model", "ModelError",
+    "Observation", "Options", "POMDPSolution", "Partition", "Poll", "Reduction", "Simulation", "SolvedTask",
     "SymbolicModel", "Task", "TaskHierarchy", "__version__", "array_pomdp", "boolean", "certify", "check",
-    "check_tasks", "compile_model", "conditional", "domains", "executable", "flat_process", "load_domain",
-    "load_plan", "lottery", "minimise", "plan", "plan_report", "reachable_states", "read", "reduce",
-    "save_plan", "simulate", "solve_mdp", "solve_pomdp", "uniform", "unreduced_pomdp", "write",
+    "check_tasks", "choose_tracker", "compile_model", "conditional", "domains", "executable",
+    "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan", "load_pomdp_plan",
+    "lottery", "measure", "minimise", "plan", "plan_report", "plan_tracker", "reachable_states", "read",
+    "reduce", "save_plan", "save_pomdp_plan", "simulate", "solve_mdp", "solve_pomdp", "uniform",
+    "unreduced_pomdp", "write",
 ]  # fmt: skip
 
 

@@ -6,8 +6,10 @@ rules and the blanks between columns are left out of the comparison.
 
 from __future__ import annotations
 
+import io
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,6 +62,20 @@ def test_the_commands_print_what_it_says(folder: Path, capsys: pytest.CaptureFix
             assert comparable(capsys.readouterr().out) == comparable(expected), command
             ran += 1
     assert ran >= 4
+
+
+def test_the_dialogue_goes_as_it_says(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (block,) = blocks("dialogue")
+    commands = re.findall(r"^\$ factored-polca (.+)$", block, re.MULTILINE)
+    expected = re.sub(r"^\$ .+\n", "", block, flags=re.MULTILINE)
+    typed = re.findall(r"^\S.*\S> (.+)$", expected, re.MULTILINE)
+    for command in commands:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "stdin", io.StringIO("".join(f"{line}\n" for line in typed)))
+        assert main(shlex.split(command)) == 0, command
+    assert comparable(capsys.readouterr().out) == comparable(expected)
 
 
 def test_the_python_examples_do_what_their_comments_say(

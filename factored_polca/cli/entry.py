@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   factored-polca simulate robot.polca --episodes 1000
   factored-polca solve tiger -o tiger.policy    a partially observed model
   factored-polca simulate tiger.policy
+  factored-polca run nurse.polca                a dialogue, after plan nursebot -o nurse.polca
 """
 
 SOLVE_NOTES = """solvers:
