@@ -12,9 +12,13 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 from factored_polca import __version__
 from factored_polca.models.errors import LimitReached, ModelError
+
+if TYPE_CHECKING:
+    from factored_polca.cli.output import Output
 
 DESCRIPTION = """Plan factored Markov decision processes with task hierarchies: each subtask is
 minimised exactly on decision diagrams, without enumerating states, and solved.  Partially observed
@@ -271,14 +275,21 @@ def discount(text: str) -> Fraction:
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
-    from factored_polca.cli import act, models, plan, run, simulate, solve
+    from factored_polca.cli import act, models, plan, simulate, solve
     from factored_polca.cli import commands as work
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
-        "run": run.run, "simulate": simulate.simulate, "solve": solve.solve,
+        "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
     }  # fmt: skip
+
+
+def run_plan(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `run`, whose module loads all that tracks beliefs."""
+    from factored_polca.cli.run import run as work
+
+    return work(arguments, output)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
