@@ -139,8 +139,9 @@ def parser() -> argparse.ArgumentParser:
         help=f"no more than N trials a task ({TRIALS})",
     )
     group.add_argument(
-        "--episodes", type=counting, default=1000, metavar="N", help="episodes that measure it (1000)"
-    )
+        "--episodes", type=counting, metavar="N",
+        help="that measure each task with children (1000 the root, 250 others; 100 without blocks)",
+    )  # fmt: skip
     group.add_argument("--polca", action="store_true", help="plan as if the state were seen: PolCA")
     sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
     with_model(sub)

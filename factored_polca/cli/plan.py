@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from factored_polca.hierarchy import HierarchicalPlan, Options, PomdpPlan
     from factored_polca.simulation.measure import Measurement
 
+CHILD_EPISODES = 250
+"""Episodes that measure a task other than the root, unless a number is given."""
+
 
 def plan(arguments: argparse.Namespace, output: Output) -> int:
     """Plan a hierarchy, print the table, write the plan."""
@@ -124,8 +127,16 @@ def plan_partial(
         found = plan_pomdp(source.model, source.tasks, options, progress=progress)
         polca = planned_as_seen(source, options, output)
         policy = executable_pomdp(found)
-        output.update(f"measuring {source.name}: {arguments.episodes:,} episodes")
-        measured = measure(policy, episodes=arguments.episodes, seed=arguments.seed)
+        output.update(f"measuring {source.name}")
+        measured = measure(
+            policy,
+            episodes=arguments.episodes,
+            child_episodes=CHILD_EPISODES if arguments.episodes is None else arguments.episodes,
+            seed=arguments.seed,
+            progress=lambda task, first, step: output.update(
+                f"measuring {task}: episodes from {first + 1:,} on, step {step:,}"
+            ),
+        )
     data = pomdp_plan_report(found, polca) | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:
