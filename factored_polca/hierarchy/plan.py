@@ -120,11 +120,14 @@ def plan_mdp(
     options: Options | None = None,
     *,
     progress: Progress | None = None,
+    symbolic: SymbolicModel | None = None,
 ) -> HierarchicalPlan:
     """Plan a model with PolCA; without tasks, as one flat task.
 
     A partially observed model is planned as if its state were seen where `options.assume_observed` says so:
     the paper's PolCA run on a POMDP.  All values are then those of seeing the state.
+
+    `symbolic` is the model if it has been compiled already: plans that share it share their diagrams.
 
     Raises:
         ModelError: the model or the hierarchy is not right, or a start state can't avoid a dead end.
@@ -153,7 +156,7 @@ def plan_mdp(
             [Fault("a finite horizon can't be planned for", ("horizon",), "remove it, or give a discount")]
         )
     hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
-    symbolic = compile_model(
+    symbolic = symbolic or compile_model(
         model,
         order=options.order,
         tasks=hierarchy,

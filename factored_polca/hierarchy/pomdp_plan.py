@@ -102,8 +102,11 @@ def plan_pomdp(
     options: Options | None = None,
     *,
     progress: Progress | None = None,
+    symbolic: SymbolicModel | None = None,
 ) -> PomdpPlan:
     """Plan a partially observed model with PolCA+; without tasks, as one flat task.
+
+    `symbolic` is the model if it has been compiled already: plans that share it share their diagrams.
 
     Raises:
         ModelError: the model or the hierarchy is not right; discount 1 or a finite horizon.
@@ -113,7 +116,7 @@ def plan_pomdp(
     began = time.perf_counter()
     refuse_unplannable(model)
     hierarchy = checked(model, tasks or flat_task(model))
-    symbolic = compile_model(
+    symbolic = symbolic or compile_model(
         model,
         order=options.order,
         tasks=hierarchy,
