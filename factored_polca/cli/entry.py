@@ -171,6 +171,7 @@ def parser() -> argparse.ArgumentParser:
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
+    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
@@ -200,7 +201,66 @@ BELIEF = (
     "where the state is not seen: features, independent, with their probabilities, such as "
     "battery=low,person=room:0.9/physio:1/10; others as at the start, as all are if it is not given"
 )
+
+
+def add_figures(sub: argparse.ArgumentParser) -> None:
+    """The figures, each with its options."""
+    figures = sub.add_subparsers(dest="which", required=True, metavar="FIGURE")
+
+    def one(name: str, text: str) -> argparse.ArgumentParser:
+        found = figures.add_parser(name, help=text, description=text)
+        # Without a default they leave what stands before the figure's name as it is.
+        found.add_argument(
+            "--json", action="store_true", default=argparse.SUPPRESS, help="print one JSON object only"
+        )
+        found.add_argument(
+            "-q", "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress, no notes"
+        )
+        found.add_argument(
+            "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the model"
+        )
+        found.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
+        found.add_argument(
+            "--trials",
+            type=counting,
+            default=TRIALS,
+            metavar="N",
+            help=f"trials a task of PolCA+ ({TRIALS})",
+        )
+        return found
+
+    def with_picture(found: argparse.ArgumentParser) -> None:
+        found.add_argument(
+            "model", metavar="MODEL", nargs="?", default="nursebot", help="nursebot if not given"
+        )
+        found.add_argument("-o", "--output", metavar="FILE.png", help="draw it (needs matplotlib)")
+
+    def with_flat_trials(found: argparse.ArgumentParser) -> None:
+        found.add_argument(
+            "--flat-trials", type=counting, default=FLAT_TRIALS, metavar="N",
+            help=f"trials of SARSOP without a hierarchy ({FLAT_TRIALS})",
+        )  # fmt: skip
+
+    with_picture(one("4a", "Parameters of the tasks' models: without abstraction, by PolCA, by PolCA+."))
+    found = one("4b", "What PolCA+, PolCA, QMDP and flat SARSOP earn, over time.")
+    with_picture(found)
+    with_flat_trials(found)
+    found.add_argument("--episodes", type=counting, metavar="N", help="1000; with --perturbations 300")
+    found.add_argument(
+        "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
+    )
+    found.add_argument(
+        "--perturbations", type=counting, metavar="N",
+        help="compare on N models with randomly changed numbers, without SARSOP",
+    )  # fmt: skip
+    found.add_argument(
+        "--perturbation", type=discount, metavar="Q", help="by up to which share they are changed (0.2)"
+    )
+    with_flat_trials(one("table1", "What the controller does in the dialogue of the paper's Table 1."))
+
+
 TRIALS = 100
+FLAT_TRIALS = 200
 ORDERS = ("auto", "file", "force", "spectral")
 FLAT_SOLVERS = (
     "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",
@@ -276,13 +336,14 @@ def discount(text: str) -> Fraction:
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
-    from factored_polca.cli import act, models, plan, simulate, solve
+    from factored_polca.cli import act, figure, models, plan, simulate, solve
     from factored_polca.cli import commands as work
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
+        "figure": figure.figure,
     }  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Table 1: what the controller does where the paper's robot was, after each of its twenty observations.
 
-The belief follows the paper's dialogue, not ours.  From b_1 = b0, which the "(null)" observation stands for,
+The belief follows the paper's dialogue, not ours.  From b_1 = b0, which "(null)" stands for,
 
     b_{i+1}(x') ~ sum over x of b_i(x) T(x, a_i, x') P(o_{i+1} | x', x, a_i)
 
@@ -12,8 +12,8 @@ answer a compared with a_i by looking one step ahead without a hierarchy:
 
 V being the lower bound that SARSOP proves on the flat quotient, asked for at all b_i.  A gap above 0 says
 that with good play from then on the controller's answer earns more; one below 0 that the paper's action
-does, and so that the hierarchy, or modelling children at corners, costs that here.  Beside it stands what the
-answer is worth more in the model of the task where the paths to the two actions part, which is how the
+does, and so that the hierarchy, or modelling children at corners, costs that here.  Beside it stands what
+the answer is worth more in the model of the task where the paths to the two actions part, which is how the
 controller sees it.
 """
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, Final
 
 import numpy as np
@@ -87,10 +87,10 @@ class Reply:
     """What the controller answers at one row.
 
     `path` lists the tasks polled.  `likelihood` is the probability that the belief before gave to the
-    observation, None at the start; `impossible` says why it was skipped.  `beliefs` gives for each feature the
-    likeliest value and its probability.  `expected` and `expected_theirs` are the mean rewards at the belief
-    of the controller's answer and of the source's action.  `gap` is Q(answer) - Q(theirs), and `parted`,
-    `task_gap` the task where the paths part and the same in its model; `flat` what SARSOP would do.
+    observation, None at the start; `impossible` says why it was skipped.  `beliefs` gives for each feature
+    the likeliest value and its probability.  `expected` and `expected_theirs` are the mean rewards at the
+    belief of the controller's answer and of the source's action.  `gap` is Q(answer) - Q(theirs), `parted`
+    and `task_gap` the task where the paths part and the same in its model; `flat` what SARSOP would do.
     """
 
     turn: Turn
@@ -245,7 +245,7 @@ def follow(start: Belief, dialogue: Sequence[Turn]) -> list[tuple[Belief, str]]:
     """The belief before each turn's action, and why its observation was skipped ("" where it was not)."""
     numbers = {action.name: i for i, action in enumerate(start.tracker.symbolic.actions)}
     found, belief = [(start, "")], start
-    for before, turn in zip(dialogue, dialogue[1:], strict=False):
+    for before, turn in pairwise(dialogue):
         action, impossible = numbers[before.action], ""
         try:
             belief = belief.after(action, _reading(belief, action, turn))
