@@ -7,7 +7,6 @@ Functions called `draw_*` take axes, draw a study there, and answer the axes; no
 from __future__ import annotations
 
 import io
-import math
 import os
 import secrets
 from collections.abc import Callable
@@ -95,9 +94,7 @@ def draw_parameters(study: ParameterStudy, ax: Axes) -> Axes:
         bars = ax.bar(
             places[known] + (number - 1) * width, heights, 0.92 * width, color=COLOURS[reading], label=label
         )
-        ax.bar_label(
-            bars, [_short(count) for count in heights], fontsize=7, color="#404040", padding=1.5
-        )  # fmt: skip
+        ax.bar_label(bars, [_short(n) for n in heights], fontsize=7, color="#404040", padding=1.5)
     ax.set_yscale("log")
     _, high = ax.get_ylim()
     ax.set_ylim(10, 2 * high)
@@ -133,9 +130,15 @@ def _name_curves(study: RewardStudy, ax: Axes) -> None:
     """The names of the curves at their right ends, moved apart where they would overlap."""
     low, high = ax.get_ylim()
     room = 0.055 * (high - low)
-    level = -math.inf
-    for one in sorted(study.earned, key=lambda one: float(one.cumulative[-1])):
-        level = max(float(one.cumulative[-1]), level + room)
+    ends = sorted(study.earned, key=lambda one: float(one.cumulative[-1]))
+    levels = [float(one.cumulative[-1]) for one in ends]
+    for k in range(1, len(levels)):
+        levels[k] = max(levels[k], levels[k - 1] + room)
+    ceiling = high
+    for k in reversed(range(len(levels))):
+        levels[k] = min(levels[k], ceiling)
+        ceiling = levels[k] - room
+    for one, level in zip(ends, levels, strict=True):
         ax.annotate(
             one.name, (1, level), xycoords=("axes fraction", "data"), xytext=(5, 0),
             textcoords="offset points", color=COLOURS[one.name], va="center", fontweight="bold",
@@ -177,7 +180,7 @@ def _tidy(ax: Axes, legend: Literal["best", "upper left"] | None = None, columns
 
 
 def _short(count: int) -> str:
-    """A count in three digits or so."""
-    if count < 10_000:
-        return f"{count:,}"
-    return f"{count / 1000:.0f}k"
+    """A count in two or three digits."""
+    if count < 1000:
+        return f"{count}"
+    return f"{count / 1000:.1f}k" if count < 10_000 else f"{count / 1000:.0f}k"
