@@ -159,6 +159,8 @@ def draw_perturbations(study: PerturbationStudy, ax: Axes) -> Axes:
     ax.set_xticks([run.seed for run in study.runs])
     ax.tick_params(axis="x", labelsize=8)
     ax.set_xlim(0, len(study.runs) + 1)
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + 0.12 * (high - low))  # room for the legend
     ax.set_xlabel("seed of the perturbed numbers")
     ax.set_ylabel("difference in discounted return")
     ax.set_title(
@@ -166,10 +168,10 @@ def draw_perturbations(study: PerturbationStudy, ax: Axes) -> Axes:
         "standard errors",
         loc="left",
     )
-    return _tidy(ax, legend="best", columns=len(PAIRS))
+    return _tidy(ax, legend="upper left", columns=len(PAIRS))
 
 
-def _tidy(ax: Axes, legend: Literal["best", "upper left"] | None = None, columns: int = 1) -> Axes:
+def _tidy(ax: Axes, legend: Literal["upper left"] | None = None, columns: int = 1) -> Axes:
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
     ax.grid(axis="y", color="#e4e4e4", linewidth=0.7)
