@@ -260,7 +260,7 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
 
 
 TRIALS = 100
-FLAT_TRIALS = 200
+FLAT_TRIALS = 300
 ORDERS = ("auto", "file", "force", "spectral")
 FLAT_SOLVERS = (
     "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",

@@ -29,7 +29,7 @@ from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
 from factored_polca.studies.parameters import Progress, as_if_seen, silent
 from factored_polca.symbolic import SymbolicModel, compile_model
 
-FLAT_TRIALS = 200
+FLAT_TRIALS = 300
 """Trials of the flat SARSOP: some 15 seconds on the nursing robot."""
 
 FLAT_GAP = 1e-3
