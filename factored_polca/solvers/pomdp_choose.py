@@ -34,6 +34,7 @@ from factored_polca.solvers.fast_informed import solve_fib
 from factored_polca.solvers.finite_horizon import Method, solve_finite_horizon
 from factored_polca.solvers.graph_iteration import solve_by_graph_iteration
 from factored_polca.solvers.hsvi import solve_hsvi
+from factored_polca.solvers.interrupts import held_interrupt, interrupts_at_polls
 from factored_polca.solvers.pbvi import solve_pbvi
 from factored_polca.solvers.perseus import solve_perseus
 from factored_polca.solvers.pomdp_problem import Problem, prepare
@@ -86,14 +87,17 @@ def solve_pomdp(
     demand = Demand() if demand is None else demand
     _check(pomdp, method, horizon, demand)
     began = time.perf_counter()
-    problem = prepare(pomdp, roots)
-    if horizon is not None:
-        algorithm: Method = "witness" if method == "witness" else "incremental pruning"
-        found = solve_finite_horizon(problem, horizon, demand, method=algorithm)
-    elif method in _SINGLE:
-        found = _SINGLE[method](problem, demand)
-    else:
-        found = _automatic(problem, demand, method == "exact", roots is not None)
+    with interrupts_at_polls():
+        problem = prepare(pomdp, roots)
+        if horizon is not None:
+            algorithm: Method = "witness" if method == "witness" else "incremental pruning"
+            found = solve_finite_horizon(problem, horizon, demand, method=algorithm)
+        elif method in _SINGLE:
+            found = _SINGLE[method](problem, demand)
+        else:
+            found = _automatic(problem, demand, method == "exact", roots is not None)
+        if held_interrupt() and not found.converged:
+            found = replace(found, status="interrupted")
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -148,7 +152,9 @@ def _search(
         notes.append(f"SARSOP: gap {run.widest_gap:.3g} after {STALLED} trials")
         other = solve_by_graph_iteration(problem, _limited(demand, FEW_BACKUPS), everywhere=False)
         notes.append(f"policy iteration: {other.iterations} exact backups, gap {other.gap:.3g}")
-        if not (other.converged or other.status in ("interrupted", "time limit")):
+        if other.status in ("interrupted", "time limit"):
+            status = other.status
+        elif not other.converged:
             status = run.run()
     found = run.solution(status)
     return replace(_better(found, other, demand), note=_joined([*notes, found.note]))

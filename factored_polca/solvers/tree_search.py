@@ -384,12 +384,13 @@ def run_search(
 
 
 def begun(problem: Problem, demand: Demand, style: Style, memory_limit: int) -> Search:
-    """A search with its starting bounds; after Ctrl-C they are computed once more, then it ends at once."""
+    """A search with its starting bounds; after Ctrl-C with simpler ones, and it ends at once."""
     try:
         return Search(problem, demand, style, memory_limit)
     except KeyboardInterrupt:
-        run = Search(problem, replace(demand, progress=None), style, memory_limit)
-        run.stopped = True
+        quiet = replace(demand, progress=None)
+        run = Search(problem, replace(quiet, deadline=0.0), style, memory_limit)
+        run.demand, run.stopped = quiet, True
         return run
 
 
