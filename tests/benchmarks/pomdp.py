@@ -234,7 +234,11 @@ def factors(matrices: Any) -> tuple[Any, Any] | None:
     for matrix, rate in zip(matrices, rates, strict=True):
         if abs(matrix - total @ diags_array(rate)).max() > 1e-9:
             return None
-    return total, np.column_stack(rates)
+    seen = np.column_stack(rates)
+    # Rounding leaves probabilities just above 1, which other programs refuse.
+    sums = total.sum(axis=1)
+    scale = diags_array(1.0 / np.where(sums > 0, sums, 1.0))
+    return csr_array(scale @ total), seen / seen.sum(axis=1, keepdims=True)
 
 
 def write_pomdp(pomdp: Any, path: Path) -> str:
@@ -254,7 +258,8 @@ def write_pomdp(pomdp: Any, path: Path) -> str:
     names = sorted({name for row in pomdp.observations for name in row})
     lines = [f"discount: {pomdp.discount!r}", "values: reward", f"states: {states}"]
     lines += [f"actions: {len(pomdp.actions)}", f"observations: {len(names)}"]
-    lines.append("start: " + " ".join(f"{p:.17g}" for p in (pomdp.initial @ merged).tolist()))
+    belief = pomdp.initial @ merged
+    lines.append("start: " + " ".join(f"{p:.17g}" for p in (belief / belief.sum()).tolist()))
     foretold = len(np.unique(pomdp.observed[pomdp.initial > 0])) == 1
     for a, matrices in enumerate(pomdp.kernel):
         found = factors([csr_array(matrix @ merged) for matrix in matrices])
