@@ -5,9 +5,9 @@
 1. where everything is seen, the MDP's solver;
 2. unfolding the beliefs that b0 can reach, up to `FEW_BELIEFS`: where they close, the belief MDP is an
    ordinary one (not where roots are given: the policy is wanted on the whole simplex then);
-3. SARSOP; where `STALLED` trials were not enough and there are at most `FEW_STATES` states, policy
-   iteration on policy graphs for some exact backups, then SARSOP again.  Bounds are joined, and the
-   policy with the better lower bound is returned.
+3. with more than `FEW_STATES` states, trials of SARSOP and HSVI2 in turns: each alone stalls somewhere;
+4. else SARSOP; where `STALLED` trials were not enough, policy iteration on policy graphs for some exact
+   backups, then SARSOP again.  Bounds are joined, and the policy with the better lower bound is returned.
 
 "exact" does the same, but up to `VERY_FEW_STATES` states policy iteration comes before SARSOP.
 
@@ -45,6 +45,7 @@ from factored_polca.solvers.sarsop import STYLE, solve_sarsop
 from factored_polca.solvers.tree_search import MEMORY_LIMIT, begun, nothing_to_gain
 from factored_polca.solvers.unfolding import solve_by_unfolding
 
+TURNS: Final = replace(STYLE, name="SARSOP and HSVI2 in turns", turns=True)
 FEW_BELIEFS: Final = 400
 STALLED: Final = 1000
 FEW_STATES: Final = 12
@@ -145,8 +146,9 @@ def _automatic(problem: Problem, demand: Demand, exact: bool, everywhere: bool) 
 def _search(
     problem: Problem, demand: Demand, notes: list[str], other: POMDPSolution | None, *, try_graph: bool
 ) -> POMDPSolution:
-    """SARSOP, with policy iteration in between where it is tried; `other` is a result to join."""
-    run = begun(problem, demand, STYLE, MEMORY_LIMIT)
+    """Trials, with policy iteration in between where it is tried; `other` is a result to join."""
+    style = STYLE if len(problem.states) <= FEW_STATES else TURNS
+    run = begun(problem, demand, style, MEMORY_LIMIT)
     status = run.run(STALLED if try_graph and demand.iterations is None else None)
     if try_graph and status == "iteration limit" and demand.iterations is None:
         notes.append(f"SARSOP: gap {run.widest_gap:.3g} after {STALLED} trials")
