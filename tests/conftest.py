@@ -9,6 +9,12 @@ import signal
 
 import pytest
 
+from factored_polca.cli import BLAS_THREADS
+
+# Before numpy is loaded, as the command line does.
+for name in BLAS_THREADS:
+    os.environ.setdefault(name, "1")
+
 # A shell that starts a command in the background without job control has it ignore Ctrl-C, and processes
 # hand that down.  Tests that interrupt processes would then wait for ever.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,7 @@ from factored_polca.solvers.belief_tree import (
 )
 from factored_polca.solvers.hsvi import STYLE as HSVI
 from factored_polca.solvers.hsvi import solve_hsvi
+from factored_polca.solvers.pomdp_choose import TURNS
 from factored_polca.solvers.pomdp_problem import Problem, prepare
 from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
 from factored_polca.solvers.sarsop import STYLE as SARSOP
@@ -83,8 +84,8 @@ NAMES = (
     "dense 323",
 )
 POMDPS = {case.name: case.pomdp for case in CASES if case.name in NAMES} | {"roomy": roomy(0)}
-SOLVERS = {"HSVI2": solve_hsvi, "SARSOP": solve_sarsop}
-STYLES = {"HSVI2": HSVI, "SARSOP": SARSOP}
+SOLVERS = {"HSVI2": solve_hsvi, "SARSOP": solve_sarsop, "turns": partial(run_search, style=TURNS)}
+STYLES = {"HSVI2": HSVI, "SARSOP": SARSOP, "turns": TURNS}
 
 each_style = pytest.mark.parametrize("style", STYLES)
 each_problem = pytest.mark.parametrize("name", NAMES)

@@ -312,6 +312,8 @@ def solve_amdp(
             finally:
                 if statistics.count.any():
                     plan = _plan(statistics, corners, demand)
+            if plan.status == "interrupted":
+                raise KeyboardInterrupt
     except TimeIsUp:
         status = "time limit"
     except KeyboardInterrupt:

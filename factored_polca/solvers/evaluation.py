@@ -16,6 +16,7 @@ from scipy.sparse.linalg import splu
 
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 from factored_polca.solvers.graph import distance_order
+from factored_polca.solvers.interrupts import raise_held_interrupt
 from factored_polca.solvers.pairs import Pairs
 from factored_polca.solvers.sweeps import backup, initial_choice
 
@@ -44,7 +45,8 @@ class StopRule:
     progress: Callable[[int, float], None] | None = field(default=None, compare=False)
 
     def poll(self) -> None:
-        """Raises `TimeIsUp` once the deadline has passed."""
+        """Raises `TimeIsUp` once the deadline has passed, KeyboardInterrupt where Ctrl-C waits."""
+        raise_held_interrupt()
         if self.deadline is not None and time.monotonic() >= self.deadline:
             raise TimeIsUp
 

@@ -5,9 +5,9 @@
 1. where everything is seen, the MDP's solver;
 2. unfolding the beliefs that b0 can reach, up to `FEW_BELIEFS`: where they close, the belief MDP is an
    ordinary one (not where roots are given: the policy is wanted on the whole simplex then);
-3. SARSOP; where `STALLED` trials were not enough and there are at most `FEW_STATES` states, policy
-   iteration on policy graphs for some exact backups, then SARSOP again.  Bounds are joined, and the
-   policy with the better lower bound is returned.
+3. with more than `FEW_STATES` states, trials of SARSOP and HSVI2 in turns: each alone stalls somewhere;
+4. else SARSOP; where `STALLED` trials were not enough, policy iteration on policy graphs for some exact
+   backups, then SARSOP again.  Bounds are joined, and the policy with the better lower bound is returned.
 
 "exact" does the same, but goes on to policy iteration after a fifth of those trials.  (Policy iteration
 first would be quicker on some problems of two states; on one of three its exact backups took minutes where
@@ -36,6 +36,7 @@ from factored_polca.solvers.fast_informed import solve_fib
 from factored_polca.solvers.finite_horizon import Method, solve_finite_horizon
 from factored_polca.solvers.graph_iteration import solve_by_graph_iteration
 from factored_polca.solvers.hsvi import solve_hsvi
+from factored_polca.solvers.interrupts import held_interrupt, interrupts_at_polls
 from factored_polca.solvers.pbvi import solve_pbvi
 from factored_polca.solvers.perseus import solve_perseus
 from factored_polca.solvers.pomdp_problem import Problem, prepare
@@ -46,6 +47,7 @@ from factored_polca.solvers.sarsop import STYLE, solve_sarsop
 from factored_polca.solvers.tree_search import MEMORY_LIMIT, begun, nothing_to_gain
 from factored_polca.solvers.unfolding import solve_by_unfolding
 
+TURNS: Final = replace(STYLE, name="SARSOP and HSVI2 in turns", turns=True)
 FEW_BELIEFS: Final = 400
 STALLED: Final = 1000
 FEW_STATES: Final = 12
@@ -87,14 +89,17 @@ def solve_pomdp(
     demand = Demand() if demand is None else demand
     _check(pomdp, method, horizon, demand)
     began = time.perf_counter()
-    problem = prepare(pomdp, roots)
-    if horizon is not None:
-        algorithm: Method = "witness" if method == "witness" else "incremental pruning"
-        found = solve_finite_horizon(problem, horizon, demand, method=algorithm)
-    elif method in _SINGLE:
-        found = _SINGLE[method](problem, demand)
-    else:
-        found = _automatic(problem, demand, method == "exact", roots is not None)
+    with interrupts_at_polls():
+        problem = prepare(pomdp, roots)
+        if horizon is not None:
+            algorithm: Method = "witness" if method == "witness" else "incremental pruning"
+            found = solve_finite_horizon(problem, horizon, demand, method=algorithm)
+        elif method in _SINGLE:
+            found = _SINGLE[method](problem, demand)
+        else:
+            found = _automatic(problem, demand, method == "exact", roots is not None)
+        if held_interrupt() and not found.converged:
+            found = replace(found, status="interrupted")
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -136,14 +141,17 @@ def _automatic(problem: Problem, demand: Demand, exact: bool, everywhere: bool) 
 def _search(
     problem: Problem, demand: Demand, notes: list[str], stalled: int, *, try_graph: bool
 ) -> POMDPSolution:
-    """SARSOP; where policy iteration is tried, in between after `stalled` trials."""
-    run, other = begun(problem, demand, STYLE, MEMORY_LIMIT), None
+    """Trials; where policy iteration is tried, in between after `stalled` of them."""
+    style = STYLE if len(problem.states) <= FEW_STATES else TURNS
+    run, other = begun(problem, demand, style, MEMORY_LIMIT), None
     status = run.run(stalled if try_graph and demand.iterations is None else None)
     if try_graph and status == "iteration limit" and demand.iterations is None:
         notes.append(f"SARSOP: gap {run.widest_gap:.3g} after {stalled} trials")
         other = solve_by_graph_iteration(problem, _limited(demand, FEW_BACKUPS), everywhere=False)
         notes.append(f"policy iteration: {other.iterations} exact backups, gap {other.gap:.3g}")
-        if not (other.converged or other.status in ("interrupted", "time limit")):
+        if other.status in ("interrupted", "time limit"):
+            status = other.status
+        elif not other.converged:
             status = run.run()
     found = run.solution(status)
     return replace(_better(found, other, demand), note=_joined([*notes, found.note]))

@@ -15,6 +15,7 @@ from factored_polca.explicit.arrays import FloatArray
 from factored_polca.explicit.entropy_policy import EntropyPolicy
 from factored_polca.explicit.policy_graph import PolicyGraph
 from factored_polca.solvers.evaluation import TimeIsUp
+from factored_polca.solvers.interrupts import raise_held_interrupt
 from factored_polca.solvers.result import Guarantee, Status
 
 Policy: TypeAlias = AlphaVectors | StagedVectors | PolicyGraph | EntropyPolicy
@@ -36,7 +37,8 @@ class Demand:
     progress: Callable[[float, float], None] | None = field(default=None, compare=False)
 
     def poll(self) -> None:
-        """Raises `TimeIsUp` once the deadline has passed."""
+        """Raises `TimeIsUp` once the deadline has passed, KeyboardInterrupt where Ctrl-C waits."""
+        raise_held_interrupt()
         if self.deadline is not None and time.monotonic() >= self.deadline:
             raise TimeIsUp
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -309,7 +310,11 @@ def solve_with(
     if problem.classes == 0:
         observed_process(problem)  # refuses a discount of 1
         return _nothing(problem, method)
-    run = Run(problem, demand)
+    try:
+        run = Run(problem, demand)
+    except KeyboardInterrupt:  # bounds to return, as simple as they come at once
+        run = Run(problem, replace(demand or Demand(), progress=None, deadline=0.0))
+        run.status = "interrupted"
     why = "interrupted before the first iteration"
     try:
         run.report()

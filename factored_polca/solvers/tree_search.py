@@ -82,6 +82,7 @@ class Style:
 
     name: str
     sarsop: bool
+    turns: bool = False  # every other batch takes the other method's trials
     share: float = 0.95  # a trial's width, as a share of the widest gap at a root
     fine: float = 1e-3  # falls of an upper bound below this share of the trial's width make no point
     batch: int = 20
@@ -217,14 +218,16 @@ class Search:
     def _batch(self, limit: int | None) -> bool:
         """Trials up to the next multiple of the batch, in slices of about 0.1 s; whether done."""
         style, problem = self.style, self.problem
-        target = (int(self.tree.counts[TRIALS]) // style.batch + 1) * style.batch
+        number = int(self.tree.counts[TRIALS]) // style.batch
+        sarsop = style.sarsop != (style.turns and number % 2 == 1)
+        target = (number + 1) * style.batch
         if limit is not None:
             target = min(target, limit)
         while int(self.tree.counts[TRIALS]) < target:
             started, trials = time.perf_counter(), target - int(self.tree.counts[TRIALS])
             code = search(
                 problem.arrays, self.tree, self.trial, self.roots, problem.discount, self.goal,
-                style.share, style.fine, style.sarsop, min(self.slice, trials), self.next_tidy, self.least,
+                style.share, style.fine, sarsop, min(self.slice, trials), self.next_tidy, self.least,
             )  # fmt: skip
             elapsed = time.perf_counter() - started
             self.slice = self.slice * 2 if elapsed < 0.05 else max(1, self.slice // 2)
@@ -384,12 +387,13 @@ def run_search(
 
 
 def begun(problem: Problem, demand: Demand, style: Style, memory_limit: int) -> Search:
-    """A search with its starting bounds; after Ctrl-C they are computed once more, then it ends at once."""
+    """A search with its starting bounds; after Ctrl-C with simpler ones, and it ends at once."""
     try:
         return Search(problem, demand, style, memory_limit)
     except KeyboardInterrupt:
-        run = Search(problem, replace(demand, progress=None), style, memory_limit)
-        run.stopped = True
+        quiet = replace(demand, progress=None)
+        run = Search(problem, replace(quiet, deadline=0.0), style, memory_limit)
+        run.demand, run.stopped = quiet, True
         return run
 
 

@@ -18,7 +18,7 @@ from factored_polca.solvers.finite_horizon import solve_finite_horizon
 from factored_polca.solvers.graph_iteration import solve_by_graph_iteration
 from factored_polca.solvers.pomdp_choose import solve_pomdp
 from factored_polca.solvers.pomdp_problem import prepare
-from factored_polca.solvers.pomdp_result import Demand
+from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
 from factored_polca.solvers.sarsop import STYLE
 from factored_polca.solvers.tree_beliefs import rehash
 from factored_polca.solvers.tree_search import MEMORY_LIMIT, Search
@@ -49,32 +49,38 @@ def ring(cells: int = CELLS) -> ArrayPOMDP:
     )
 
 
+def _ended(found: POMDPSolution) -> None:
+    """Solvers keep Ctrl-C to themselves: here nobody wants the result, so it is raised once more."""
+    if found.status == "interrupted":
+        raise KeyboardInterrupt
+
+
 def _search(pomdp: ArrayPOMDP) -> None:
     run = Search(prepare(pomdp), Demand(gap=1e-9, iterations=120), STYLE, MEMORY_LIMIT)
-    run.solution(run.run())
+    _ended(run.solution(run.run()))
     rehash(run.tree)  # needed by long searches only
 
 
 def _rounds(name: str) -> Callable[[ArrayPOMDP], None]:
     def run(pomdp: ArrayPOMDP) -> None:
-        solve_pomdp(pomdp, name, demand=Demand(gap=1e-3, iterations=3))
+        _ended(solve_pomdp(pomdp, name, demand=Demand(gap=1e-3, iterations=3)))
 
     return run
 
 
 def _exact(pomdp: ArrayPOMDP) -> None:
     problem = prepare(ring(6))
-    solve_by_unfolding(problem, Demand(gap=1e-3), beliefs=30)
-    solve_by_graph_iteration(problem, Demand(gap=1e-3, iterations=1))
+    _ended(solve_by_unfolding(problem, Demand(gap=1e-3), beliefs=30))
+    _ended(solve_by_graph_iteration(problem, Demand(gap=1e-3, iterations=1)))
     _search(pomdp)
 
 
 def _staged(_: ArrayPOMDP) -> None:
-    solve_finite_horizon(prepare(ring(6)), 4, Demand(gap=1e-3))
+    _ended(solve_finite_horizon(prepare(ring(6)), 4, Demand(gap=1e-3)))
 
 
 def _witness(_: ArrayPOMDP) -> None:
-    solve_finite_horizon(prepare(ring(6)), 3, Demand(gap=1e-3), method="witness")
+    _ended(solve_finite_horizon(prepare(ring(6)), 3, Demand(gap=1e-3), method="witness"))
 
 
 _WORK: Final[Mapping[str, Callable[[ArrayPOMDP], None]]] = {
