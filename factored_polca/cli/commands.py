@@ -5,14 +5,20 @@ from __future__ import annotations
 import argparse
 import os
 import resource
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_actions
 from factored_polca.formats import destination
 from factored_polca.models import LimitReached
+
+COMPILING = "compiling numeric kernels, once for this installation (10 to 20 seconds)"
+"""What is said where that has to be done."""
 
 ACTIONS_SHOWN = 30
 """Actions in a table before the rest is summed up."""
@@ -40,18 +46,54 @@ def compile_kernels(output: Output, pomdp_method: str | None = None) -> float:
     """Compile or load the numeric kernels, those of a POMDP solver too; say so where it takes long."""
     from factored_polca.hierarchy.warm import is_compiled, warm_up
 
-    def work() -> float:
-        seconds = warm_up()
+    def work(elsewhere: subprocess.Popen[bytes] | None) -> None:
+        warm_up()
         if pomdp_method is not None:
             from factored_polca.solvers import warm_pomdp
 
-            seconds += warm_pomdp.warm_up(pomdp_method)
-        return seconds
+            if elsewhere is not None:
+                elsewhere.wait()
+            warm_pomdp.warm_up(pomdp_method)
 
+    began = time.perf_counter()
     if is_compiled():
-        return work()
-    with output.progress("compiling numeric kernels, once for this installation (10 to 20 seconds)"):
-        return work()
+        with announced_compiling(output):
+            work(None)
+    else:
+        with output.progress(COMPILING), compiling_elsewhere(pomdp_method) as elsewhere:
+            work(elsewhere)
+    return time.perf_counter() - began
+
+
+@contextmanager
+def announced_compiling(output: Output) -> Iterator[None]:
+    """Say so where something inside has to be compiled."""
+    from factored_polca.solvers.compiled import watch_compiling
+
+    with watch_compiling(lambda: output.note(COMPILING)):
+        yield
+
+
+@contextmanager
+def compiling_elsewhere(pomdp_method: str | None) -> Iterator[subprocess.Popen[bytes] | None]:
+    """A second process that compiles the kernels of a POMDP solver, where there is a core for it.
+
+    It leaves them on disk, from where this process loads them.  Should it fail, this process compiles
+    them itself.
+    """
+    if pomdp_method is None or (os.cpu_count() or 1) < 2:
+        yield None
+        return
+    program = f"from factored_polca.solvers.warm_pomdp import warm_up; warm_up({pomdp_method!r})"
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", program],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def limits(arguments: argparse.Namespace) -> tuple[int | None, float | None]:

@@ -15,6 +15,8 @@ An option whose upper bound lies below the node's lower bound is never looked at
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from factored_polca.explicit.arrays import FloatArray, IntArray
@@ -54,6 +56,10 @@ from factored_polca.solvers.belief_tree import (
 from factored_polca.solvers.compiled import kernel
 from factored_polca.solvers.pomdp_problem import Arrays
 from factored_polca.solvers.tree_beliefs import expand, open_node
+
+# Numbers of numpy's types: numba compiles a kernel anew for each literal that it is called with.
+REFRESH: Final = np.bool_(True)
+NONE: Final = np.int64(-1)
 
 
 @kernel
@@ -165,7 +171,7 @@ def settle(a: Arrays, t: Tree, n: int, discount: float, threshold: float, least:
             ):
                 return -1
             expand(a, t, n, j, c)
-        choice_value(a, t, j, c, discount, True)
+        choice_value(a, t, j, c, discount, bool(REFRESH))
         if best_choice(a, t, n) == j:
             break
     value = t.choice[c, CHOICE_UPPER]
@@ -196,7 +202,7 @@ def back_up(a: Arrays, t: Tree, n: int, discount: float, least_gain: float) -> N
     y = t.node[n, CLASS]
     refresh_lower(t, n)
     low = a.first_option[y]
-    best, option = t.bound[n, LOWER] + least_gain, -1
+    best, option = t.bound[n, LOWER] + least_gain, int(NONE)
     for j in range(low, a.first_option[y + 1]):
         c = t.node[n, FIRST_CHOICE] + j - low
         if t.first_child[c] >= 0 and t.choice[c, CHOICE_UPPER] > best:

@@ -15,6 +15,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.belief_tree import (
     BASE,
@@ -49,6 +51,10 @@ comes next, the length of `Tree.path`, the node to go on from, the trial's width
 node, SARSOP's targets."""
 TRIAL_STATE: Final = 7
 AT_REST, DOWN, BACK = range(3)
+
+# Of numpy's type: numba compiles a kernel anew for each literal that it is called with.
+LOWER_SIDE: Final = np.int64(LOWER)
+UPPER_SIDE: Final = np.int64(UPPER)
 
 LEARNING: Final = 0.1
 """How much the newest lower bound counts in the mean of its bin, at least."""
@@ -178,8 +184,8 @@ def descend(
             worth = max(t.bound[n, LOWER], known_lower(a, t, j, c, discount))
             lower_target = max(trial[LOWER_TARGET], worth)
             upper_target = max(trial[UPPER_TARGET], worth + trial[ALLOWED])
-            trial[LOWER_TARGET] = passed_on(a, t, j, c, place, lower_target, discount, LOWER)
-            trial[UPPER_TARGET] = passed_on(a, t, j, c, place, upper_target, discount, UPPER)
+            trial[LOWER_TARGET] = passed_on(a, t, j, c, place, lower_target, discount, int(LOWER_SIDE))
+            trial[UPPER_TARGET] = passed_on(a, t, j, c, place, upper_target, discount, int(UPPER_SIDE))
         trial[ALLOWED] /= discount
         trial[NODE] = t.child[place]
 
