@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from factored_polca.control.polling import ask
-from factored_polca.control.tracker import Belief, ChosenTracker, OnImpossible, choose_tracker
+from factored_polca.control.tracker import (
+    Belief,
+    ChosenTracker,
+    OnImpossible,
+    choose_tracker,
+    tested_features,
+)
 from factored_polca.diagrams import support
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
 from factored_polca.minimisation import Partition
@@ -48,13 +54,7 @@ class BeliefDecision:
 
 def tracked_features(plan: ExecutablePomdpPlan) -> list[str]:
     """The features that some task tells apart, or that are seen: those whose marginals are of use."""
-    symbolic = plan.symbolic
-    tested = {level for partition in plan.partitions for level in support(partition.diagram)}
-    return [
-        feature.name
-        for number, feature in enumerate(plan.model.features)
-        if feature.observed or symbolic.now(number) in tested
-    ]
+    return tested_features(plan.symbolic, [partition.diagram for partition in plan.partitions])
 
 
 def block_state(partition: Partition, block: int) -> dict[str, Value]:

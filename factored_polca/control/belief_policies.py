@@ -81,8 +81,9 @@ class PolledPolicy:
         task, here = self.plan.policies[name], beliefs[mine]
         sure = np.zeros((len(mine), len(task.actions)), dtype=np.bool_)
         for number, action in enumerate(task.actions):
-            if action in self.plan.policies:
-                sure[:, number] = ~(here[:, self.live[action]] > 0).any(axis=1)
+            live = self.live.get(action)
+            if live is not None and not live.all():  # a task that can end
+                sure[:, number] = ~(here[:, live] > 0).any(axis=1)
         chosen, _ = ask(self.plan, name, np.asarray(here @ self.onto[name]), sure)
         for number in np.unique(chosen).tolist():
             action, answered = task.actions[number], mine[chosen == number]

@@ -14,7 +14,14 @@ import numpy as np
 
 from factored_polca.control.block_tracker import BlockBelief
 from factored_polca.control.controller import Controller, Poll
-from factored_polca.control.tracker import TIE, Belief, ChosenTracker, OnImpossible, choose_tracker
+from factored_polca.control.tracker import (
+    TIE,
+    Belief,
+    ChosenTracker,
+    OnImpossible,
+    choose_tracker,
+    tested_features,
+)
 from factored_polca.hierarchy.executable import ExecutablePlan
 from factored_polca.models import ModelError, Value
 
@@ -35,8 +42,18 @@ class LikeliestDecision:
 def likeliest_tracker(
     plan: ExecutablePlan, *, on_impossible: OnImpossible = "error", seed: int = 0
 ) -> ChosenTracker:
-    """The tracker that fits a policy of states: it keeps apart where that takes different actions."""
-    return choose_tracker(plan.symbolic, conditions=[plan.policy], on_impossible=on_impossible, seed=seed)
+    """The tracker that fits a policy of states: it keeps apart the values of all features that this knows.
+
+    Features that no task of the plan tells apart do not count for what is likeliest.
+    """
+    known = [plan.policy, *(task.partition.diagram for task in plan.policies.values())]
+    return choose_tracker(
+        plan.symbolic,
+        conditions=[plan.policy],
+        features=tested_features(plan.symbolic, known),
+        on_impossible=on_impossible,
+        seed=seed,
+    )
 
 
 class LikeliestController:

@@ -22,7 +22,7 @@ b0 does not allow that either, the uniform distribution over the states that are
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.control.received import ObservationReader, Received, shown, value_number
-from factored_polca.diagrams import Diagram, Manager, MemoryLimit
+from factored_polca.diagrams import Diagram, Manager, MemoryLimit, support
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.explicit.exact_pomdp import observation_label
 from factored_polca.minimisation import Partition
@@ -233,6 +233,16 @@ def refuse_fully_observed(symbolic: SymbolicModel) -> None:
         raise ModelError(
             f"{symbolic.model.name} is fully observed: its state is known, no belief is to be tracked"
         )
+
+
+def tested_features(symbolic: SymbolicModel, diagrams: Iterable[Diagram]) -> list[str]:
+    """The features that some diagram over states tests, or that are seen, in the model's order."""
+    tested = {level for diagram in diagrams for level in support(diagram)}
+    return [
+        feature.name
+        for number, feature in enumerate(symbolic.model.features)
+        if feature.observed or symbolic.now(number) in tested
+    ]
 
 
 def summed(labels: IntArray, weights: FloatArray, count: int) -> FloatArray:

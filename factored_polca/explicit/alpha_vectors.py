@@ -13,6 +13,7 @@ is taken; over all steps that may cost TIE * max(1, |V|) / (1 - gamma).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
@@ -32,6 +33,22 @@ class AlphaSet:
     states: IntArray  # [i] the states with this y, ascending
     vectors: FloatArray  # [n, i]
     actions: IntArray  # [n]
+
+    @cached_property
+    def by_action(self) -> tuple[FloatArray, IntArray, IntArray]:
+        """The vectors [i, n] in the order of their actions, the actions [k], each one's first vector."""
+        order = np.argsort(self.actions, kind="stable")
+        actions, first = np.unique(self.actions[order], return_index=True)
+        return np.ascontiguousarray(self.vectors[order].T), actions, first.astype(np.int64)
+
+    def choose(self, beliefs: FloatArray) -> IntArray:
+        """The lowest action [n] among those with a vector as good as the best, at beliefs [n, i]."""
+        vectors, actions, first = self.by_action
+        worth = np.maximum.reduceat(beliefs @ vectors, first, axis=1)  # [n, k]
+        best = worth.max(axis=1, keepdims=True)
+        close = worth >= best - TIE * np.maximum(1.0, np.abs(best))
+        chosen: IntArray = actions[close.argmax(axis=1)]
+        return chosen
 
 
 @dataclass(frozen=True)
@@ -67,24 +84,17 @@ class AlphaVectors:
         actions = np.zeros(len(beliefs), dtype=np.int64)
         best = np.zeros(len(beliefs))
         for part in self.sets:
-            here = beliefs[:, part.states]
+            here = beliefs if len(part.states) == self.states else beliefs[:, part.states]
             mass = here.sum(axis=1)
             mine = np.flatnonzero(mass > best)
             best[mine] = mass[mine]
-            actions[mine] = _first_of_best(here[mine] @ part.vectors.T, part.actions)
+            if len(mine):
+                actions[mine] = part.choose(here if len(mine) == len(here) else here[mine])
         return actions
 
     def action(self, belief: FloatArray) -> int:
         """The action at one belief [s]."""
         return int(self.choose(belief[None, :])[0])
-
-
-def _first_of_best(worth: FloatArray, actions: IntArray) -> IntArray:
-    """The lowest action [n] among those whose vector is as good as the best, `worth` [n, vector]."""
-    best = worth.max(axis=1, keepdims=True, initial=-np.inf)
-    close = worth >= best - TIE * np.maximum(1.0, np.abs(best))
-    lowest: IntArray = np.where(close, actions[None, :], np.iinfo(np.int64).max).min(axis=1)
-    return lowest
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from factored_polca.control.belief_policies import BlockPolicy, FlatPolicy, MostLikelyPolicy, PolledPolicy
 from factored_polca.control.block_tracker import BlockTracker, make_block_tracker
-from factored_polca.control.tracker import BLOCK_LIMIT
+from factored_polca.control.tracker import BLOCK_LIMIT, tested_features
 from factored_polca.hierarchy import Options, plan_mdp, plan_pomdp
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
 from factored_polca.hierarchy.pomdp_plan import belief_policy, refuse_unplannable
@@ -137,10 +137,13 @@ def make_contest(
     progress("planning QMDP")
     flat = flat_model(symbolic, options)
     qmdp = flat.solve("qmdp")
+    partitions = [*polled.partitions, flat.reduction.partition]
+    known = [polca.root.policy, *(solved.reduction.partition.diagram for solved in polca.solved)]
     tracker = make_block_tracker(
         symbolic,
-        [*polled.partitions, flat.reduction.partition],
+        partitions,
         conditions=[*polled.conditions, polca.root.policy],
+        features=tested_features(symbolic, known),  # for the likeliest state
         block_limit=BLOCK_LIMIT,
         seed=options.seed,
     )
