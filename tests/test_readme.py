@@ -45,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_it_opens_with_what_it_is_for_and_the_two_commands() -> None:
     commands = re.findall(r"^ {4}(.+)$", README, re.MULTILINE)[:2]
     assert commands == [
-        "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/factored-polca plan taxi",
+        "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/factored-polca plan nursebot",
         "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest",
     ]
     assert README.index(commands[0]) < 1200
@@ -76,6 +76,23 @@ def test_the_dialogue_goes_as_it_says(
         monkeypatch.setattr(sys, "stdin", io.StringIO("".join(f"{line}\n" for line in typed)))
         assert main(shlex.split(command)) == 0, command
     assert comparable(capsys.readouterr().out) == comparable(expected)
+
+
+def test_the_nursing_robot_s_table_has_the_counts_that_it_shows(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Counts are exact; what is searched and simulated may differ with the machine in its last digits."""
+    (shown,) = blocks("output")
+    assert shown.startswith("$ factored-polca plan nursebot\n")
+    assert main(["plan", "nursebot", "--episodes", "2", "-q"]) == 0
+    printed = capsys.readouterr().out
+    row = re.compile(r"^(\w+) +(\d+) +(\d+) +(\d+ -> \d+) +([\d,]+) +([\d,]+) +([\d,]+) ", re.MULTILINE)
+    ours, theirs = row.findall(printed), row.findall(shown)
+    assert [r[0] for r in theirs] == ["Remind", "Contact", "Move", "Inform", "Assist", "Rest", "Act"]
+    children = [r for r in theirs if r[0] not in ("Assist", "Act")]  # the others hang on their policies
+    assert [r for r in ours if r[0] not in ("Assist", "Act")] == children
+    (upper,) = re.findall(r"no policy earns more than (\S+)", shown)
+    assert f"no policy earns more than {upper}" in printed
 
 
 def test_the_python_examples_do_what_their_comments_say(

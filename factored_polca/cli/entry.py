@@ -20,9 +20,9 @@ from factored_polca.models.errors import LimitReached, ModelError
 if TYPE_CHECKING:
     from factored_polca.cli.output import Output
 
-DESCRIPTION = """Plan factored Markov decision processes with task hierarchies: each subtask is
-minimised exactly on decision diagrams, without enumerating states, and solved.  Partially observed
-models are solved flat, state by state."""
+DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
+hierarchies: each subtask is minimised exactly on decision diagrams, without enumerating states, and
+solved (PolCA, PolCA+).  Small models are solved flat, state by state."""
 
 EXAMPLES = """examples:
   factored-polca plan taxi --set size=10        plan a shipped domain
