@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from factored_polca.solvers import MDPSolution, solve_mdp
     from factored_polca.solvers.pomdp_choose import solve_pomdp
     from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
+    from factored_polca.solvers.proposal import alpha_vectors, solution_of_actions, solution_of_policy
+    from factored_polca.solvers.protocol import MdpSolver, PomdpSolver
     from factored_polca.symbolic import SymbolicModel, compile_model, reachable_states
 
 __version__ = "0.1.0"
@@ -97,6 +99,8 @@ _HOME: Final = {
     "solvers": ("MDPSolution", "solve_mdp"),
     "solvers.pomdp_choose": ("solve_pomdp",),
     "solvers.pomdp_result": ("Demand", "POMDPSolution"),
+    "solvers.proposal": ("alpha_vectors", "solution_of_actions", "solution_of_policy"),
+    "solvers.protocol": ("MdpSolver", "PomdpSolver"),
     "symbolic": ("SymbolicModel", "compile_model", "reachable_states"),
 }  # fmt: skip
 """Module -> the public names it holds."""
@@ -110,14 +114,15 @@ __all__ = [
     "Aborted", "Action", "ArrayPOMDP", "Belief", "BeliefController", "BeliefDecision", "BeliefRuns",
     "Certificate", "Controller", "Decision", "Demand", "Diagram", "Document", "ExecutablePlan",
     "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
-    "MDPSolution", "Manager", "Measurement", "MemoryLimit", "Minimisation", "Model", "ModelError",
-    "Observation", "Options", "POMDPSolution", "Partition", "Poll", "Reduction", "Simulation", "SolvedTask",
-    "SymbolicModel", "Task", "TaskHierarchy", "__version__", "array_pomdp", "boolean", "certify", "check",
-    "check_tasks", "choose_tracker", "compile_model", "conditional", "domains", "executable",
-    "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan", "load_pomdp_plan",
-    "lottery", "measure", "minimise", "plan", "plan_report", "plan_tracker", "reachable_states", "read",
-    "reduce", "save_plan", "save_pomdp_plan", "simulate", "solve_mdp", "solve_pomdp", "uniform",
-    "unreduced_pomdp", "write",
+    "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation", "Model",
+    "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpSolver",
+    "Reduction", "Simulation", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "__version__",
+    "alpha_vectors", "array_pomdp", "boolean", "certify", "check", "check_tasks", "choose_tracker",
+    "compile_model", "conditional", "domains", "executable", "executable_pomdp", "flat_process",
+    "independent_belief", "load_domain", "load_plan", "load_pomdp_plan", "lottery", "measure",
+    "minimise", "plan", "plan_report", "plan_tracker", "reachable_states", "read", "reduce",
+    "save_plan", "save_pomdp_plan", "simulate", "solution_of_actions", "solution_of_policy",
+    "solve_mdp", "solve_pomdp", "uniform", "unreduced_pomdp", "write",
 ]  # fmt: skip
 
 

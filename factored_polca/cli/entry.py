@@ -42,6 +42,8 @@ SOLVE_NOTES = """solvers:
   sarsop, hsvi, pbvi, perseus   point-based: a policy, and bounds on the optimum
   qmdp, fib, blind, amdp        quick and coarse; for qmdp, fib and amdp simulate tells what they earn
   vi, pi, mpi                   fully observed models: value, policy, modified policy iteration
+  package.module:Name           any solver that can be called as factored_polca.solvers.protocol says;
+                                the module is imported, so name only what you trust
 
 --gap and --epsilon are one thing: upper - lower at the start.  Without them 0.001, for exact 1e-6; fully
 observed models are solved to 1e-9 of the largest value.  There is no time limit but --time, which counts
@@ -118,8 +120,9 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
     sub.add_argument(
-        "--solver", default="auto", choices=FLAT_SOLVERS, metavar="NAME",
-        help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has",
+        "--solver", default="auto", type=solver, metavar="NAME",
+        help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has; or "
+        "package.module:Name, which is imported",
     )  # fmt: skip
     sub.add_argument("--no-flat", action="store_true", help="leave out the flat optimum")
     sub.add_argument(
@@ -182,7 +185,7 @@ def parser() -> argparse.ArgumentParser:
 def add_solving(sub: argparse.ArgumentParser) -> None:
     """The options of `solve` beside the model's."""
     sub.epilog, sub.formatter_class = SOLVE_NOTES, argparse.RawDescriptionHelpFormatter
-    sub.add_argument("--solver", default="auto", choices=FLAT_SOLVERS, metavar="NAME", help="see below")
+    sub.add_argument("--solver", default="auto", type=solver, metavar="NAME", help="see below")
     sub.add_argument("--gap", type=gap, metavar="G", help="stop at upper - lower <= G at the start")
     sub.add_argument("--epsilon", type=gap, metavar="E", help="the same as --gap")
     sub.add_argument("--time", type=positive, metavar="SECONDS", help="solve no longer than that")
@@ -259,6 +262,7 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
     with_flat_trials(one("table1", "What the controller does in the dialogue of the paper's Table 1."))
 
 
+REFERENCE = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 TRIALS = 100
 FLAT_TRIALS = 300
 ORDERS = ("auto", "file", "force", "spectral")
@@ -266,6 +270,14 @@ FLAT_SOLVERS = (
     "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",
     "pi", "mpi",
 )  # fmt: skip
+
+
+def solver(text: str) -> str:
+    """The name of a solver of ours, or `package.module:Name`."""
+    if text not in FLAT_SOLVERS and REFERENCE.fullmatch(text) is None:
+        listed = ", ".join(FLAT_SOLVERS)
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {listed}, nor written package.module:Name")
+    return text
 
 
 def natural(text: str) -> int:

@@ -26,6 +26,7 @@ from factored_polca.models.model import replace_fields
 if TYPE_CHECKING:
     from factored_polca.explicit.policies import AnyPolicy
     from factored_polca.minimisation.flat_model import FlatModel
+    from factored_polca.solvers.pomdp_result import Demand
     from factored_polca.solvers.result import Guarantee, Status
     from factored_polca.symbolic import SymbolicModel
 
@@ -57,6 +58,13 @@ class Task:
     deadline: Callable[[], float | None]  # counted from the call, `time.monotonic()`
     iterations: int | None
     seed: int
+    custom: Callable[..., Any] | None = None  # a solver that is not ours
+
+    def demand(self, gap: float, progress: Callable[[float, float], None] | None = None) -> Demand:
+        """What a solver is asked for, from now on."""
+        from factored_polca.solvers.pomdp_result import Demand
+
+        return Demand(gap, self.deadline(), self.iterations, self.seed, progress)
 
 
 @dataclass(frozen=True)
@@ -164,6 +172,8 @@ def checked_task(source: Source, arguments: argparse.Namespace) -> Task:
     Raises:
         UsageError: options that do not go together, with each other or with the model.
     """
+    from factored_polca.solvers.protocol import load_solver
+
     model, solver = source.model, arguments.solver
     if arguments.discount is not None:
         model = replace_fields(model, discount=arguments.discount)
@@ -172,7 +182,8 @@ def checked_task(source: Source, arguments: argparse.Namespace) -> Task:
             model, horizon=None if arguments.horizon == "infinite" else arguments.horizon
         )
     full = model.observability == "full"
-    as_mdp = solver in MDP_METHODS and (full or solver != "auto")
+    own = ":" not in solver
+    as_mdp = (solver in MDP_METHODS and (full or solver != "auto")) or (full and not own)
     if as_mdp and not full:
         raise UsageError(
             f"{solver} solves fully observed models; {source.name} is partially observed: use --solver "
@@ -187,7 +198,7 @@ def checked_task(source: Source, arguments: argparse.Namespace) -> Task:
     return Task(
         model, solver, chosen_gap(arguments, as_mdp), as_mdp,
         lambda: None if arguments.time is None else time.monotonic() + arguments.time,
-        arguments.iterations, arguments.seed,
+        arguments.iterations, arguments.seed, None if own else load_solver(solver),
     )  # fmt: skip
 
 
@@ -206,7 +217,7 @@ def refuse_horizon(
             f"{said} asks for {horizon} steps; at most {LONGEST_HORIZON:,} are solved for: give a shorter "
             "one, or --horizon infinite"
         )
-    able = ("auto", "vi") if as_mdp else STAGED
+    able = ("auto", "vi") if as_mdp and ":" not in solver else STAGED
     if solver not in able:
         both = ", ".join(STAGED if model.observability == "partial" else ("auto", "vi", "exact", "witness"))
         raise UsageError(
@@ -241,7 +252,7 @@ def wanted(task: Task) -> float | None:
 def warm(task: Task, output: Output) -> float:
     """Load or compile the kernels that are needed; the seconds that took."""
     seconds = compile_kernels(output)
-    if task.as_mdp:
+    if task.as_mdp or task.custom is not None:
         return seconds
     from factored_polca.solvers.compiled import watch_compiling
     from factored_polca.solvers.warm_pomdp import warm_up
@@ -295,14 +306,17 @@ def work(task: Task, flat: FlatModel, source: Source, output: Output) -> tuple[F
 def solve_as_pomdp(task: Task, flat: FlatModel, show: Callable[[str], None]) -> Found:
     """The solution of a partially observed model, or of one taken for such."""
     from factored_polca.solvers.pomdp_choose import solve_pomdp
-    from factored_polca.solvers.pomdp_result import Demand
+    from factored_polca.solvers.protocol import call_pomdp_solver
 
     def progress(lower: float, upper: float) -> None:
         show(f"the value lies in {lower:.6g} .. {upper:.6g}, gap {upper - lower:.3g}")
 
     gap = EXACT_GAP if task.gap is None else task.gap
-    demand = Demand(gap, task.deadline(), task.iterations, task.seed, progress)
-    found = solve_pomdp(flat.pomdp, task.solver, demand=demand, horizon=task.model.horizon)
+    demand = task.demand(gap, progress)
+    if task.custom is not None:
+        found = call_pomdp_solver(task.custom, flat.pomdp, demand)
+    else:
+        found = solve_pomdp(flat.pomdp, task.solver, demand=demand, horizon=task.model.horizon)
     return Found(
         found.lower, found.upper, found.value, found.policy, found.status, found.guarantee, found.method,
         found.vectors, found.iterations, found.seconds, found.note,
@@ -316,20 +330,24 @@ def solve_as_mdp(task: Task, flat: FlatModel, show: Callable[[str], None]) -> Fo
     """
     from factored_polca.explicit.state_policy import StatePolicy
     from factored_polca.solvers.choose import solve_mdp
+    from factored_polca.solvers.protocol import call_mdp_solver
 
     began, deadline = time.perf_counter(), task.deadline()
     epsilon = MDP_EPSILON if task.gap is None else task.gap
     mdp, initial = flat.to_mdp(), flat.pomdp.initial
     for _ in range(2):
-        found = solve_mdp(
-            mdp,
-            MDP_METHODS[task.solver],
-            epsilon,
-            deadline=deadline,
-            iterations=task.iterations,
-            progress=lambda n, gap: show(f"{n} iterations, gap {gap:.3g}"),
-            describe=flat.state_text,
-        )
+        if task.custom is not None:
+            found = call_mdp_solver(task.custom, mdp, task.demand(epsilon))
+        else:
+            found = solve_mdp(
+                mdp,
+                MDP_METHODS[task.solver],
+                epsilon,
+                deadline=deadline,
+                iterations=task.iterations,
+                progress=lambda n, gap: show(f"{n} iterations, gap {gap:.3g}"),
+                describe=flat.state_text,
+            )
         largest = float(np.abs(found.values[np.isfinite(found.values)]).max(initial=0.0))
         margin = (np.count_nonzero(initial) + 4) * 2.0**-52 * largest
         lower, upper = at_start(initial, found.lower) - margin, at_start(initial, found.upper) + margin

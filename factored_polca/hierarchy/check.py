@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 import networkx as nx
 import numpy as np
@@ -12,6 +13,7 @@ from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, check
 from factored_polca.models.tasks import Task
 from factored_polca.solvers import METHODS, solve_mdp
 from factored_polca.solvers.pomdp_choose import POMDP_METHODS
+from factored_polca.solvers.protocol import load_solver
 from factored_polca.symbolic import SymbolicModel
 
 TASK_METHODS: Final = tuple(method for method in POMDP_METHODS if method != "witness")
@@ -63,12 +65,46 @@ def checked(model: Model, hierarchy: TaskHierarchy, *, assume_observed: bool = F
     return resolved
 
 
+def refuse_imports(task: Task) -> None:
+    """Refuse a task that names a module to import: model files are not trusted to run programs.
+
+    Raises:
+        ModelError: it does.
+    """
+    if task.solver is not None and ":" in task.solver:
+        fault = Fault(
+            f"the solver {task.solver!r} would import a module, which a model may not ask for",
+            ("tasks", task.name, "solver"),
+            f"leave it out, and give --solver {task.solver} or Options(solver=...) yourself",
+        )
+        raise ModelError([fault])
+
+
+def custom_solver(solver: str | Callable[..., Any]) -> Callable[..., Any] | None:
+    """The solver that is not ours which `Options.solver` gives or names; None: the name of one of ours.
+
+    Raises:
+        ModelError: it can't be imported or called.
+    """
+    if not isinstance(solver, str):
+        if not callable(solver):
+            raise ModelError(f"the solver is {type(solver).__name__}: give a name, or something to call")
+        return solver
+    return load_solver(solver) if ":" in solver else None
+
+
+def named_solver(solver: str | Callable[..., Any]) -> str:
+    """The name of ours that `Options.solver` gives; "auto" where it gives a solver that is not ours."""
+    return solver if isinstance(solver, str) and ":" not in solver else "auto"
+
+
 def solver_of(task: Task, default: str = "auto") -> str:
     """The solver of a task, `default` where it names none.
 
     Raises:
         ModelError: unknown; the message lists those there are.
     """
+    refuse_imports(task)
     method = (task.solver or default).replace("_", " ").replace("-", " ")
     short = {"vi": "value iteration", "pi": "policy iteration", "mpi": "modified policy iteration"}
     method = short.get(method, method)
@@ -86,6 +122,7 @@ def pomdp_solver_of(task: Task, default: str = "auto") -> str:
     Raises:
         ModelError: unknown; the message lists those there are.
     """
+    refuse_imports(task)
     method = task.solver or default
     if method not in TASK_METHODS:
         listed = ", ".join(TASK_METHODS)

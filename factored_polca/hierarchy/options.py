@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from factored_polca.minimisation.pomdp_quotient import MAXIMUM_OBSERVATIONS
+from factored_polca.solvers.protocol import MdpSolver, PomdpSolver
 
 FLAT_BLOCK_LIMIT: Final = 100_000
 """Blocks up to which something flat is computed beside the hierarchical policy."""
@@ -21,7 +22,8 @@ class Options:
 
     `flat_block_limit` None leaves out what is said about flat policies: the optimum of a fully observed
     model, an upper bound on it of a partially observed one.  `reachable` restricts every subtask to what
-    the start can reach.  `solver` is for tasks that name none.
+    the start can reach.  `solver` is for tasks that name none: the name of one of ours,
+    "package.module:Name", or a solver itself (`factored_polca.solvers.protocol`).
 
     For models whose state is seen (PolCA) `epsilon` is the gap that solvers close, relative to the
     largest value.
@@ -40,7 +42,7 @@ class Options:
     flat_block_limit: int | None = FLAT_BLOCK_LIMIT
     memory_limit: int | None = None
     deadline: float | None = None
-    solver: str = "auto"
+    solver: str | PomdpSolver | MdpSolver = "auto"
     gap: float | None = None
     trials: int | None = TRIALS
     maximum_observations: int = MAXIMUM_OBSERVATIONS

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, relabel
-from factored_polca.hierarchy.check import checked, planning_order, solver_of
+from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_q_values
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
@@ -38,6 +38,8 @@ from factored_polca.models import (
     flat_task,
 )
 from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
+from factored_polca.solvers.pomdp_result import Demand
+from factored_polca.solvers.protocol import MdpSolver, call_mdp_solver
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 Progress = Callable[[str, str, int, int], None]
@@ -190,6 +192,7 @@ class _Planner:
         self.symbolic, self.hierarchy = symbolic, hierarchy
         self.options, self.progress = options, progress
         self.solved: dict[str, SolvedTask] = {}
+        self.custom = None if options.assume_observed else custom_solver(options.solver)
         self.reachable: Diagram | None = None
         if options.reachable:
             from factored_polca.symbolic.reach import reachable_states
@@ -210,15 +213,22 @@ class _Planner:
             progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
         )
 
-    def optimise(self, name: str, reduction: Reduction, method: str) -> MDPSolution:
+    def optimise(
+        self, name: str, reduction: Reduction, method: str, custom: MdpSolver | None = None
+    ) -> MDPSolution:
         self.tell(name, "solve", 0, reduction.partition.blocks)
-        solution = solve_mdp(
-            reduction.quotient.mdp,
-            method,
-            self.options.epsilon,
-            deadline=self.options.deadline,
-            describe=lambda block: describe_block(reduction, block),
-        )
+        if custom is not None:
+            options = self.options
+            demand = Demand(gap=options.epsilon, deadline=options.deadline, seed=options.seed)
+            solution = call_mdp_solver(custom, reduction.quotient.mdp, demand)
+        else:
+            solution = solve_mdp(
+                reduction.quotient.mdp,
+                method,
+                self.options.epsilon,
+                deadline=self.options.deadline,
+                describe=lambda block: describe_block(reduction, block),
+            )
         if solution.status == "interrupted":
             raise KeyboardInterrupt
         if solution.status == "time limit":
@@ -234,11 +244,13 @@ class _Planner:
         """Steps 2 to 4 of PolCA for one task."""
         began = time.perf_counter()
         self.tell(task.name, "parameterise")
-        method = "auto" if self.options.assume_observed else solver_of(task, self.options.solver)
+        method = (
+            "auto" if self.options.assume_observed else solver_of(task, named_solver(self.options.solver))
+        )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.reduce(task.name, process, self.options.block_limit)
         refuse_without_purpose(task, reduction.quotient.mdp)
-        solution = self.optimise(task.name, reduction, method)
+        solution = self.optimise(task.name, reduction, method, self.custom if task.solver is None else None)
         counts = count_q_values(process, reduction.partition, self.options.seed)
         policy = reduction.lift_policy(solution.policy)
         chosen = np.append(solution.policy >= 0, False).astype(np.uint64)

@@ -29,7 +29,13 @@ from typing import Final
 import numpy as np
 
 from factored_polca.diagrams import Diagram
-from factored_polca.hierarchy.check import checked, planning_order, pomdp_solver_of
+from factored_polca.hierarchy.check import (
+    checked,
+    custom_solver,
+    named_solver,
+    planning_order,
+    pomdp_solver_of,
+)
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_solved import (
     BeliefPolicy,
@@ -42,6 +48,7 @@ from factored_polca.minimisation import DecisionProcess, Reduction, flat_process
 from factored_polca.models import Fault, LimitReached, Model, ModelError, Task, TaskHierarchy, flat_task
 from factored_polca.solvers.pomdp_choose import solve_pomdp
 from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
+from factored_polca.solvers.protocol import call_pomdp_solver, name_of
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 Progress = Callable[[str, str, int, int], None]
@@ -164,6 +171,7 @@ class _Planner:
         self.symbolic, self.hierarchy = symbolic, hierarchy
         self.options, self.progress = options, progress
         self.solved: dict[str, SolvedPomdpTask] = {}
+        self.custom = custom_solver(options.solver)
         self.reachable: Diagram | None = None
         if options.reachable:
             from factored_polca.symbolic.reach import reachable_states
@@ -192,7 +200,7 @@ class _Planner:
         """Steps 1 to 4 of the module's docstring for one task."""
         began = time.perf_counter()
         self.tell(task.name, "parameterise")
-        method = pomdp_solver_of(task, self.options.solver)
+        method = pomdp_solver_of(task, named_solver(self.options.solver))
         channels = planning_channels(self.symbolic.model, task)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable, channels)
         reduction = self.reduce(task.name, process, self.options.block_limit)
@@ -224,7 +232,11 @@ class _Planner:
             iterations=options.trials if method in SEARCHES else None,
             seed=options.seed,
         )
-        solution = solve_pomdp(pomdp, method, demand=demand, roots=roots)
+        if self.custom is not None and task.solver is None:
+            solution = call_pomdp_solver(self.custom, pomdp, demand, roots)
+            refuse_memory(solution, name_of(self.custom))
+        else:
+            solution = solve_pomdp(pomdp, method, demand=demand, roots=roots)
         if solution.status == "interrupted":
             raise KeyboardInterrupt
         if solution.status == "time limit":
@@ -257,6 +269,19 @@ class _Planner:
         if found.status == "interrupted":
             raise KeyboardInterrupt
         return FlatBound(found.upper, pomdp.states, "fast informed bound on the flat quotient")
+
+
+def refuse_memory(solution: POMDPSolution, name: str) -> None:
+    """Refuse a policy that is no map from beliefs: polling keeps no memory for it.
+
+    Raises:
+        ModelError: naming the solver.
+    """
+    if not isinstance(solution.policy, BeliefPolicy):
+        raise ModelError(
+            f"the solver {name} returned {type(solution.policy).__name__}, which is no map from beliefs to "
+            "actions: return AlphaVectors; solvers.proposal.solution_of_policy makes them of a policy graph"
+        )
 
 
 def belief_policy(solution: POMDPSolution) -> BeliefPolicy:
