@@ -35,6 +35,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "hierarchy": HIERARCHY,  # plan files hold the model in the native format
     "control": CONTROL,
     "simulation": {"control", "hierarchy", "explicit", *SYMBOLIC},  # what it runs is a hierarchy's plan
+    # the kit for other packages' tests reads everything that it checks
+    "testing": {"simulation", "control", *HIERARCHY},
     "studies": {"simulation", "control", "library", *HIERARCHY},
     # from the top package: the version
     "cli": {"studies", "simulation", "control", "library", "", *HIERARCHY},

@@ -60,7 +60,7 @@ def _kind(thing: Any) -> str:
 
 
 def _slack(*numbers: float) -> float:
-    return SLACK * max(1.0, *(abs(number) for number in numbers if np.isfinite(number)))
+    return SLACK * max([1.0, *(abs(number) for number in numbers if np.isfinite(number))])
 
 
 def _wrong_words(found: POMDPSolution | MDPSolution) -> Iterator[str]:
