@@ -35,6 +35,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "hierarchy": HIERARCHY,  # plan files hold the model in the native format
     "control": CONTROL,
     "simulation": {"control", "hierarchy", "explicit", *SYMBOLIC},  # what it runs is a hierarchy's plan
+    # what it adapts: solvers and files of POMDPs; for Gymnasium models, and sampling from them
+    "external": {"simulation", "solvers", "formats", "explicit", *SYMBOLIC},
     # the kit for other packages' tests reads everything that it checks
     "testing": {"simulation", "control", *HIERARCHY},
     "studies": {"simulation", "control", "library", *HIERARCHY},
