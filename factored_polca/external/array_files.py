@@ -47,13 +47,17 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """What the file says: T [a] of [s, t], O [a] of [t, z], rewards [a, s]."""
+class FactoredRows:
+    """What the file says, over its states i: T [a] of [i, j], O [a] of [j, z], rewards [a, i].
+
+    `place[s]` is the file's state for an original one, `owner[i]` the original one of a file's state.
+    """
 
     moves: list[SparseMatrix]
     shows: list[FloatArray]
     rewards: FloatArray
     place: IntArray
+    owner: IntArray
 
 
 def lay_out(pomdp: ArrayPOMDP, starts: Sequence[FloatArray]) -> Layout:
@@ -62,14 +66,23 @@ def lay_out(pomdp: ArrayPOMDP, starts: Sequence[FloatArray]) -> Layout:
     Raises:
         LimitReached: more entries than a file should have.
     """
-    kernel, count = _by_observation(pomdp)
-    rows = _factored(pomdp, kernel) or _split(pomdp, kernel, count)
+    rows = factored_rows(pomdp)
     belief = np.zeros(len(rows.rewards[0]))
     if len(starts) == 1:
         np.add.at(belief, rows.place, starts[0])
     else:
         rows, belief = _with_starts(rows, starts)
     return Layout(_text(pomdp, rows, belief), len(belief), rows.place)
+
+
+def factored_rows(pomdp: ArrayPOMDP) -> FactoredRows:
+    """T, O and rewards, states split where there is no other way.
+
+    Raises:
+        LimitReached: more entries than may be listed.
+    """
+    kernel, count = _by_observation(pomdp)
+    return _factored(pomdp, kernel) or _split(pomdp, kernel, count)
 
 
 def _by_observation(pomdp: ArrayPOMDP) -> tuple[list[dict[int, SparseMatrix]], int]:
@@ -98,7 +111,7 @@ def _by_observation(pomdp: ArrayPOMDP) -> tuple[list[dict[int, SparseMatrix]], i
     return result, max(1, len(numbers))
 
 
-def _factored(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]]) -> _Rows | None:
+def _factored(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]]) -> FactoredRows | None:
     """T and O over the original states; None where they are not enough."""
     states, count = pomdp.states, 1 + max((z for row in kernel for z in row), default=0)
     end = np.flatnonzero(pomdp.terminal)
@@ -120,10 +133,10 @@ def _factored(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]]) -> _Rows
         shows.append(seen)
     place = np.arange(states)
     place[end] = end[:1]
-    return _Rows(moves, shows, pomdp.rewards, place)
+    return FactoredRows(moves, shows, pomdp.rewards, place, np.arange(states))
 
 
-def _split(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]], count: int) -> _Rows:
+def _split(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]], count: int) -> FactoredRows:
     """T and O over pairs (t, z); a state that nothing leads to keeps one pair of its own."""
     pairs = sorted({(int(t), z) for row in kernel for z, m in row.items() for t in np.unique(m.indices)})
     end = np.flatnonzero(pomdp.terminal)
@@ -161,10 +174,10 @@ def _split(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]], count: int)
         if len(end):
             total = total + csr_array(([1.0], ([size - 1], [size - 1])), shape=(size, size))
         moves.append(csr_array(total))
-    return _Rows(moves, [seen] * len(kernel), pomdp.rewards[:, owners], place)
+    return FactoredRows(moves, [seen] * len(kernel), pomdp.rewards[:, owners], place, owners)
 
 
-def _with_starts(rows: _Rows, starts: Sequence[FloatArray]) -> tuple[_Rows, FloatArray]:
+def _with_starts(rows: FactoredRows, starts: Sequence[FloatArray]) -> tuple[FactoredRows, FloatArray]:
     """One more state, from which each start is reached with equal probability, and told."""
     size = rows.rewards.shape[1]
     copies = [(number, s) for number, b in enumerate(starts) for s in np.flatnonzero(b).tolist()]
@@ -188,10 +201,11 @@ def _with_starts(rows: _Rows, starts: Sequence[FloatArray]) -> tuple[_Rows, Floa
     rewards = np.concatenate([rows.rewards, rows.rewards[:, origin], nothing], axis=1)
     belief = np.zeros(total)
     belief[-1] = 1.0
-    return _Rows(moves, shows, rewards, rows.place), belief
+    owner = np.concatenate([rows.owner, rows.owner[origin], [-1]])
+    return FactoredRows(moves, shows, rewards, rows.place, owner), belief
 
 
-def _text(pomdp: ArrayPOMDP, rows: _Rows, belief: FloatArray) -> str:
+def _text(pomdp: ArrayPOMDP, rows: FactoredRows, belief: FloatArray) -> str:
     states = len(belief)
     count = max(2, rows.shows[0].shape[1])  # pomdp-solve ends without a word where there is one only
     lines = [f"discount: {pomdp.discount!r}", "values: reward", f"states: {states}"]
