@@ -6,6 +6,7 @@ Values: tiger 19.371368 (see `small_pomdps`); the taxi's optimum by our own solv
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from factored_polca.solvers.proposal import alpha_vectors, solution_of_actions, 
 from factored_polca.solvers.protocol import call_mdp_solver, call_pomdp_solver, load_solver
 from factored_polca.solvers.verify import mdp_faults, pomdp_faults
 from factored_polca.symbolic import compile_model
+from factored_polca.testing import check_solver
 
 QMDP = """
 import numpy as np
@@ -400,3 +402,17 @@ def test_what_is_wrong_with_a_solver_is_said(
     assert status == 2
     assert said in " ".join(message.split())
     assert "a fault of factored-polca" not in message
+
+
+def test_the_solver_in_the_readme_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
+    (body,) = re.findall(r"^```python\n# qmdp\.py\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    (tmp_path / "readme_qmdp.py").write_text(body, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["plan", "tiger", "--solver", "readme_qmdp:solve", "--json"]) == 0
+    (task,) = json.loads(capsys.readouterr().out)["tasks"]
+    assert 19 < task["lower"] <= 19.371369 <= task["upper"]
+    solver = load_solver("readme_qmdp:solve")
+    check_solver(solver)
