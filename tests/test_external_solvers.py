@@ -214,7 +214,8 @@ def test_what_a_late_program_has_written_counts(folder: Path, monkeypatch: pytes
     monkeypatch.setattr("factored_polca.external.programs.GRACE_SECONDS", 2.0)
     program(folder, "pomdp-solve", f"Path(out).write_text({ALPHA!r})\ntime.sleep(600)")
     found = PomdpSolve(seconds=0.5)(TIGER, Demand(gap=1e-12), None)
-    assert found.status == "time limit"
+    assert found.status == "iteration limit"
+    assert "ended after 0.5 s" in found.note
     assert found.lower > 19.36
 
 

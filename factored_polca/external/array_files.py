@@ -31,6 +31,7 @@ from factored_polca.models.errors import LimitReached
 
 FACTORS: Final = 1e-12
 MOST_ENTRIES: Final = 5_000_000
+MOST_NUMBERS: Final = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ def factored_rows(pomdp: ArrayPOMDP) -> FactoredRows:
         LimitReached: more entries than may be listed.
     """
     kernel, count = _by_observation(pomdp)
+    if pomdp.states * count * len(kernel) > MOST_NUMBERS:
+        raise LimitReached(f"tables of more than {MOST_NUMBERS:,} numbers for observations", "external")
     return _factored(pomdp, kernel) or _split(pomdp, kernel, count)
 
 
@@ -160,6 +163,8 @@ def _split(pomdp: ArrayPOMDP, kernel: list[dict[int, SparseMatrix]], count: int)
         owner.append(int(end[0]))
         shown.append(0)
     size, owners = len(owner), np.array(owner)
+    if size * count > MOST_NUMBERS:
+        raise LimitReached(f"a table of more than {MOST_NUMBERS:,} numbers for observations", "external")
     seen = np.zeros((size, count))
     seen[np.arange(size), shown] = 1.0
     moves = []

@@ -22,16 +22,20 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 
 from factored_polca.diagrams import evaluate_states
 from factored_polca.models import Model
 from factored_polca.models.features import position
 from factored_polca.simulation.sampler import Sampler
 from factored_polca.symbolic import SymbolicModel, compile_model
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(f"{error}: pip install 'factored-polca[gym]'") from error
 
 Rewards = Literal["sampled", "expected"]
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pomdp_py
 from scipy.sparse import csr_array
 
 from factored_polca.explicit.alpha_vectors import AlphaVectors
@@ -26,6 +25,11 @@ from factored_polca.explicit.entropy_policy import EntropyPolicy
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
 from factored_polca.external.array_files import FactoredRows, factored_rows
 from factored_polca.models.errors import ModelError
+
+try:
+    import pomdp_py
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(f"{error}: pip install 'factored-polca[pomdp-py]'") from error
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,8 @@ def _solved(
     policy = alpha_vectors(pomdp, layout.vectors(table), actions)
     return solution_of_policy(
         pomdp, policy, method=program, demand=demand, roots=roots, seconds=time.perf_counter() - began,
-        status="time limit" if late else "iteration limit", note=f"{len(table)} vectors by {program}",
+        status="time limit" if demand.seconds_left <= 0 else "iteration limit",
+        note=f"{len(table)} vectors by {program}" + (f", ended after {limit:.3g} s" if late else ""),
     )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ class KnownMDP:
 
 def known_pomdps() -> tuple[KnownPOMDP, ...]:
     """POMDPs of one to eleven states: blind, mixed observability, terminal states among them."""
-    agreed = "value with six decimals that pomdp-solve 5.5, APPL and zmdp agree on"
+    agreed = "six decimals on which two or more of pomdp-solve, APPL and zmdp agree"
     return (
         KnownPOMDP("tiger, discount 0.95", tiger(0.95), 19.371366, 19.371370, agreed),
         KnownPOMDP("tiger, discount 0.75", tiger(0.75), 1.933437, 1.933441, agreed),
