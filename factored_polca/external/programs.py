@@ -43,6 +43,8 @@ from factored_polca.solvers.tree_search import nothing_to_gain
 SECONDS: Final = 600.0
 GRACE_SECONDS: Final = 5.0
 """How long a program that was told its limit may take to write what it has."""
+SHARE: Final = 0.7
+"""Share of the time left that is the program's; what it found is evaluated in the rest."""
 LARGEST_FILE: Final = 1 << 28
 
 
@@ -122,7 +124,7 @@ def _solved(
     if not starts:
         return nothing_to_gain(prepare(pomdp, roots), program)
     layout: Layout = lay_out(pomdp, starts)
-    limit = min(seconds, demand.seconds_left)
+    limit = min(seconds, SHARE * demand.seconds_left)
     with tempfile.TemporaryDirectory(prefix="factored_polca_") as name:
         folder = Path(name)
         path = folder / "problem.pomdp"

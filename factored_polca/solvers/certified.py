@@ -52,6 +52,7 @@ class _Unfolding:
     classes: list[int] = field(default_factory=list)
     options: list[int] = field(default_factory=list)
     beliefs: list[FloatArray] = field(default_factory=list)
+    promised: list[FloatArray] = field(default_factory=list)  # the vector that was best
     numbers: dict[tuple[int, bytes], int] = field(default_factory=dict)
     of_vector: dict[tuple[int, int], int] = field(default_factory=dict)
 
@@ -69,6 +70,7 @@ class _Unfolding:
         self.classes.append(y)
         self.options.append(int(self.problem.arrays.first_option[y]) + int(self.actions[y][best]))
         self.beliefs.append(belief)
+        self.promised.append(self.vectors[y][best])
         return number
 
 
@@ -82,7 +84,8 @@ def certified(problem: Problem, proposed: AlphaVectors, demand: Demand) -> tuple
     after = _unfold(state)
     controllers = _linked(state, after, None)
     goal = max(demand.gap, 1e-12) * (1 - problem.discount) / 10
-    vectors = np.zeros(int(controllers.start[-1]))
+    span = problem.value_span
+    vectors = np.clip(np.concatenate([np.zeros(0), *state.promised]), -span, span)  # where sweeps start
     best_vectors, best_values, best = vectors, np.full(len(problem.roots), -np.inf), controllers
     for _ in range(ROUNDS):
         vectors = controllers.from_below(controllers.evaluated(vectors, SWEEPS, goal, demand))
