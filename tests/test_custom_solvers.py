@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -416,3 +417,42 @@ def test_the_solver_in_the_readme_works(
     assert 19 < task["lower"] <= 19.371369 <= task["upper"]
     solver = load_solver("readme_qmdp:solve")
     check_solver(solver)
+
+
+UNTRUSTED = """name = "untrusted"
+discount = 0.9
+reward = "-1"
+terminal = "home"
+[features]
+home = "boolean"
+[actions.go]
+effects.home = "true"
+[actions.stay]
+[tasks.root]
+actions = ["go", "stay"]
+solver = "{}:Steps"
+"""
+
+
+@pytest.mark.parametrize("command", [("check",), ("plan",), ("plan", "--solver", "pi")])
+def test_a_model_file_runs_no_program(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: tuple[str, ...],
+) -> None:
+    (tmp_path / "would_be_imported.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "untrusted.toml"
+    path.write_text(UNTRUSTED.format("would_be_imported"), encoding="utf-8")
+    assert main([command[0], str(path), *command[1:]]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "untrusted.toml:12" in message
+    assert "would import a module, which a model may not ask for" in message
+    assert "would_be_imported" not in sys.modules
+
+
+def test_what_is_no_solver_is_refused() -> None:
+    model, tasks = two_rooms(None)
+    with pytest.raises(ModelError, match="the solver is int: give a name, or something to call"):
+        plan_mdp(model, tasks, Options(solver=5))  # type: ignore[arg-type]
