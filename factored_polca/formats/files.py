@@ -74,7 +74,10 @@ def _read_pomdpx(text: str, overrides: Mapping[str, str], name: str) -> Document
 
 
 def _write_pomdpx(document: Document) -> str:
-    raise ModelError([Fault("POMDPX can be read but not written yet", hint="write a .toml file")])
+    _refuse_tasks(document, "POMDPX")
+    from factored_polca.formats.pomdpx import write_pomdpx
+
+    return write_pomdpx(document.model)
 
 
 def _read_cassandra(text: str, overrides: Mapping[str, str], name: str) -> Document:
