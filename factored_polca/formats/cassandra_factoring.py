@@ -51,6 +51,7 @@ class FactoredArrays:
     initial: FloatArray  # [s]
     origin: IntArray  # [s] the state it stands for, or `END`
     symbol: IntArray  # [s] the observation of a pair, -1 of a state that is not split
+    first: IntArray  # [s of the original] the state that stands for it in beliefs
     discount: float
 
     @property
@@ -100,8 +101,14 @@ def factored(pomdp: ArrayPOMDP) -> FactoredArrays:
     initial = np.zeros(len(origin))
     np.add.at(initial, first, pomdp.initial)
     return FactoredArrays(
-        pomdp.actions, labels, transitions, observations, rewards, initial, origin, symbol, pomdp.discount
-    )
+        pomdp.actions, labels, transitions, observations, rewards, initial, origin, symbol, first,
+        pomdp.discount,
+    )  # fmt: skip
+
+
+def seen_label(label: str, seen: int) -> str:
+    """The label of an observation with what is seen of the state."""
+    return f"{label},seen{seen}"
 
 
 def _require_total(pomdp: ArrayPOMDP) -> None:
@@ -134,7 +141,7 @@ def _entries(pomdp: ArrayPOMDP, mdp: bool) -> tuple[list[_Entries], tuple[str, .
     used = np.unique(np.concatenate([part.o[~pomdp.terminal[part.t]] for part in found]))
     if not len(used):
         used = np.zeros(1, dtype=np.int64)
-    labels = [f"{names[k // kinds]},seen{k % kinds}" if news else names[k] for k in used.tolist()]
+    labels = [seen_label(names[k // kinds], k % kinds) if news else names[k] for k in used.tolist()]
     labels += [ENDED] if ended else []
     renumbered = []
     for part in found:
