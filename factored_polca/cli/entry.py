@@ -176,6 +176,7 @@ def parser() -> argparse.ArgumentParser:
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
     sub.add_argument("--no-tasks", action="store_true", help="leave the tasks out")
+    sub.add_argument("--minimise", action="store_true", help="write the quotient: a state for each block")
     return top
 
 

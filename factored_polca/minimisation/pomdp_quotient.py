@@ -154,11 +154,19 @@ class PomdpQuotient:
         Raises:
             ModelError: the format can't express it, or the file can't be written.
         """
-        from factored_polca.formats.cassandra import write_pomdp
         from factored_polca.formats.files import write_text
 
-        name = self.process.symbolic.model.name
-        write_text(path, lambda: write_pomdp(self.pomdp, name, block_texts(self.partition)))
+        write_text(path, self.to_pomdp_text)
+
+    def to_pomdp_text(self) -> str:
+        """The text that `to_pomdp` writes.
+
+        Raises:
+            ModelError: the format can't express it.
+        """
+        from factored_polca.formats.cassandra import write_pomdp
+
+        return write_pomdp(self.pomdp, self.process.symbolic.model.name, block_texts(self.partition))
 
 
 def make_pomdp_quotient(

@@ -96,11 +96,20 @@ class Quotient:
         Raises:
             ModelError: a choice does not apply everywhere, or the file can't be written.
         """
-        from factored_polca.formats.cassandra import write_mdp
         from factored_polca.formats.files import write_text
 
+        write_text(path, self.to_pomdp_text)
+
+    def to_pomdp_text(self) -> str:
+        """The text that `to_pomdp` writes.
+
+        Raises:
+            ModelError: a choice does not apply everywhere.
+        """
+        from factored_polca.formats.cassandra import write_mdp
+
         name, initial = self.process.symbolic.model.name, initial_distribution(self.partition)
-        write_text(path, lambda: write_mdp(self.mdp, initial, name, block_texts(self.partition)))
+        return write_mdp(self.mdp, initial, name, block_texts(self.partition))
 
 
 def block_texts(partition: Partition) -> list[str]:
