@@ -145,8 +145,27 @@ def test_what_is_seen_becomes_part_of_the_observation() -> None:
 
 
 def test_what_is_seen_at_the_start_must_be_foretold() -> None:
-    with pytest.raises(ModelError, match=r"leaves open what is seen first.*one file for each"):
+    with pytest.raises(ModelError, match=r"leaves open what is seen first.*--first-step"):
         write_pomdp(seen_half([0.5, 0.0, 0.5, 0.0]))
+
+
+def test_a_first_step_shows_what_is_seen_at_the_start() -> None:
+    pomdp = seen_half([0.5, 0.25, 0.125, 0.125])
+    back = read_back(write_pomdp(pomdp, first_step=True))
+    assert back.states == pomdp.states + 1
+    for horizon in (1, 2, 3):
+        ours = pomdp.discount * forward_value(pomdp, pomdp.initial, horizon)
+        assert forward_value(back, back.initial, horizon + 1) == pytest.approx(ours, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(0, 60, 2))
+def test_a_quotient_with_any_start_is_written_with_a_first_step(seed: int) -> None:
+    model = random_pomdp(seed)
+    quotient = reduce(flat_process(compile_model(model))).pomdp_quotient
+    back = read_back(quotient.to_pomdp_text(first_step=True))
+    arrays = enumerate_pomdp(model).to_arrays()
+    ours = arrays.discount * forward_value(arrays, arrays.initial, 2)
+    assert forward_value(back, back.initial, 3) == pytest.approx(ours, abs=1e-9)
 
 
 def test_names_that_the_format_lacks_are_replaced_and_told() -> None:

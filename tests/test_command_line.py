@@ -347,12 +347,14 @@ def test_convert_writes_every_format_and_info_reads_it(
 
 def test_convert_lists_states_or_blocks(run_json: Run, folder: Path) -> None:
     assert run_json("convert", "linear", "blocks.pomdp", "--set", "size=40", "--minimise") == {
-        "file": "blocks.pomdp", "states": 2**40, "written_states": 41,
+        "file": "blocks.pomdp", "states": 2**40, "blocks": 41,
     }  # fmt: skip
     assert run_json("info", "blocks.pomdp")["observability"] == "full"
-    assert run_json("convert", "linear", "flat.mdp", "--set", "size=3", "--no-tasks")["written_states"] == 4
-    assert run_json("convert", "nursebot", "n.npz", "--no-tasks")["written_states"] > 100
-    assert run_json("convert", "tiger", "t.npz", "--minimise")["written_states"] == 2
+    assert run_json("convert", "linear", "flat.mdp", "--set", "size=3", "--no-tasks")["listed"] == 4
+    assert run_json("convert", "nursebot", "n.npz", "--no-tasks")["listed"] > 100
+    assert run_json("convert", "tiger", "t.npz", "--minimise")["blocks"] == 2
+    run_json("convert", "tiger", "later.pomdp", "--minimise", "--first-step")
+    assert run_json("info", "later.pomdp")["states"] == 7  # 2 for each of 3 observations, and the first
 
 
 def test_a_file_wins_over_a_domain_of_the_same_name(run_json: Run, folder: Path) -> None:

@@ -280,8 +280,8 @@ def convert(arguments: argparse.Namespace, output: Output) -> int:
     if arguments.json:
         output.result(data)
     else:
-        listed = f" with {big(data['written_states'])} states" if "written_states" in data else ""
-        output.note(f"{arguments.output} written{listed}")
+        counts = [f"{big(data[key])} {key}" for key in ("blocks", "listed") if key in data]
+        output.note(f"{arguments.output} written{''.join(f' ({text})' for text in counts)}")
     return 0
 
 
@@ -304,8 +304,10 @@ def write_flat(
         write_npz(pomdp_fields(flat.pomdp), arguments.output)
     else:
         texts = [flat.state_text(state) for state in range(count)]
-        write_text(arguments.output, lambda: write_pomdp(flat.pomdp, source.model.name, texts))
-    return {"written_states": count}
+        first = arguments.first_step and not flat.fully_observed
+        name = source.model.name
+        write_text(arguments.output, lambda: write_pomdp(flat.pomdp, name, texts, first_step=first))
+    return {"listed": count}
 
 
 def write_quotient(
@@ -315,7 +317,7 @@ def write_quotient(
     from factored_polca.cli.commands import compile_kernels
     from factored_polca.formats import format_of, write
     from factored_polca.formats.cassandra import read_pomdp
-    from factored_polca.minimisation import flat_process, reduce
+    from factored_polca.minimisation import PomdpQuotient, flat_process, reduce
     from factored_polca.symbolic import compile_model
 
     if extension != ".npz":
@@ -323,10 +325,11 @@ def write_quotient(
     compile_kernels(output)
     with source.located(), output.progress(f"minimising {source.name}"):
         quotient = reduce(flat_process(compile_model(source.model))).quotient
+    first = {"first_step": True} if arguments.first_step and isinstance(quotient, PomdpQuotient) else {}
     if extension == ".npz":
         quotient.to_npz(arguments.output)
     elif extension in FLAT:
-        quotient.to_pomdp(arguments.output)
+        quotient.to_pomdp(arguments.output, **first)
     else:
-        write(read_pomdp(quotient.to_pomdp_text(), source.model.name), arguments.output)
-    return {"written_states": quotient.partition.blocks}
+        write(read_pomdp(quotient.to_pomdp_text(**first), source.model.name), arguments.output)
+    return {"blocks": quotient.partition.blocks}

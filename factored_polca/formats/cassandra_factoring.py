@@ -12,7 +12,8 @@ does.  The other states stay as they are.
 Observations are padded: one set for all actions, by their names.  Where states are told apart by what is
 seen of them (`observed`, y) and y is news, which the last y and the action do not foretell, it becomes part
 of the observation: o is then (o, y).  There is no observation before the first action, so the start must
-foretell its y.  If every state is seen the process is an MDP and has no observations.
+foretell its y; `with_first_step` puts a step before it that shows y.  If every state is seen the process is
+an MDP and has no observations.
 
 Terminal states are one state `end` that is never left, with reward 0 for every action and an observation
 of its own, `ended`: its value is 0, and that it was reached is seen.
@@ -106,6 +107,37 @@ def factored(pomdp: ArrayPOMDP) -> FactoredArrays:
     )  # fmt: skip
 
 
+def with_first_step(pomdp: ArrayPOMDP) -> ArrayPOMDP:
+    """`pomdp` begun one step earlier, in one more state, the last.
+
+    There every action has the reward 0 and leads to b0, so that what is seen of the state at the start is
+    seen after it.  All values at the start are those of `pomdp` times the discount.  The observation on the
+    way there tells nothing, so that `factored` splits states whose observation tells something.
+    """
+    count = pomdp.states
+    start = csr_array(pomdp.initial[None, :])
+    empty = csr_array((1, count))
+
+    def longer(matrix: SparseMatrix, row: SparseMatrix) -> SparseMatrix:
+        taller = vstack([matrix, row], format="csr")
+        return csr_array((taller.data, taller.indices, taller.indptr), shape=(count + 1, count + 1))
+
+    kernel = tuple(
+        tuple(longer(matrix, start if o == 0 else empty) for o, matrix in enumerate(matrices))
+        for matrices in pomdp.kernel
+    )
+    return ArrayPOMDP(
+        pomdp.actions,
+        pomdp.observations,
+        kernel,
+        np.pad(pomdp.rewards, ((0, 0), (0, 1))),
+        np.append(pomdp.terminal, False),
+        np.append(pomdp.observed, pomdp.observed.max() + 1),
+        np.append(np.zeros(count), 1.0),
+        pomdp.discount,
+    )
+
+
 def seen_label(label: str, seen: int) -> str:
     """The label of an observation with what is seen of the state."""
     return f"{label},seen{seen}"
@@ -161,7 +193,7 @@ def _is_news(pomdp: ArrayPOMDP) -> bool:
         raise ModelError([Fault(
             "part of the state is seen, and the start leaves open what is seen first", ("initial",),
             "this format has no observation before the first action: give the observed features one "
-            "value each at the start, one file for each of them",
+            "value each at the start, or begin with a step that shows it (--first-step)",
         )])  # fmt: skip
     for matrices in pomdp.kernel:
         pairs = []

@@ -15,7 +15,7 @@ import numpy as np
 
 from factored_polca.explicit.arrays import ArrayMDP, FloatArray, SparseMatrix
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
-from factored_polca.formats.cassandra_factoring import END, FactoredArrays, factored
+from factored_polca.formats.cassandra_factoring import END, FactoredArrays, factored, with_first_step
 from factored_polca.formats.decimals import float_row_texts, float_text
 from factored_polca.formats.spudd_names import distinct_names
 
@@ -29,12 +29,19 @@ LISTED: Final = 1_000
 """States whose meaning is told in comments."""
 
 
-def write_pomdp(pomdp: ArrayPOMDP, name: str = "", states: Sequence[str] | None = None) -> str:
+def write_pomdp(
+    pomdp: ArrayPOMDP, name: str = "", states: Sequence[str] | None = None, *, first_step: bool = False
+) -> str:
     """`pomdp` in Cassandra's format; `states` says in comments what each state is.
+
+    With `first_step` it begins a step earlier, see `cassandra_factoring.with_first_step`.
 
     Raises:
         ModelError: the format can't express it; see `cassandra_factoring.factored`.
     """
+    if first_step:
+        pomdp = with_first_step(pomdp)
+        states = None if states is None else [*states, "the beginning: a step that shows what is seen"]
     return write_factored(factored(pomdp), name, states)
 
 

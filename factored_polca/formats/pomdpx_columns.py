@@ -20,7 +20,7 @@ What a model has beyond that is brought in without changing its meaning:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import prod
@@ -39,7 +39,7 @@ from factored_polca.models.expressions import (
     rewrite,
 )
 from factored_polca.models.features import Feature
-from factored_polca.models.model import Action, InitialBelief, Model, Observation, replace_fields
+from factored_polca.models.model import Action, InitialBelief, Model, replace_fields
 from factored_polca.models.scalars import Value, describe, scalar
 
 MAXIMUM_JOINT: Final = 10_000
@@ -269,8 +269,3 @@ def _labels(joints: Sequence[Joint], name: str, changed: list[str]) -> tuple[str
 def _tell(old: str, new: str, changed: list[str]) -> None:
     if old != new:
         changed.append(f"{old} is {new}")
-
-
-def declared(channel: Observation, names: Names) -> Iterable[str]:
-    """The values of a channel as they are spelled."""
-    return names.values[channel.name]

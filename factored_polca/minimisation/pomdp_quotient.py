@@ -148,17 +148,20 @@ class PomdpQuotient:
 
         write_npz(pomdp_fields(self.pomdp), path)
 
-    def to_pomdp(self, path: str | Path) -> None:
+    def to_pomdp(self, path: str | Path, *, first_step: bool = False) -> None:
         """Write the quotient as a file in Cassandra's format; it appears whole or not at all.
+
+        With `first_step` it begins a step earlier, which shows what is seen of the state at the start;
+        all values there are then multiplied by the discount.
 
         Raises:
             ModelError: the format can't express it, or the file can't be written.
         """
         from factored_polca.formats.files import write_text
 
-        write_text(path, self.to_pomdp_text)
+        write_text(path, lambda: self.to_pomdp_text(first_step=first_step))
 
-    def to_pomdp_text(self) -> str:
+    def to_pomdp_text(self, *, first_step: bool = False) -> str:
         """The text that `to_pomdp` writes.
 
         Raises:
@@ -166,7 +169,8 @@ class PomdpQuotient:
         """
         from factored_polca.formats.cassandra import write_pomdp
 
-        return write_pomdp(self.pomdp, self.process.symbolic.model.name, block_texts(self.partition))
+        name, texts = self.process.symbolic.model.name, block_texts(self.partition)
+        return write_pomdp(self.pomdp, name, texts, first_step=first_step)
 
 
 def make_pomdp_quotient(
