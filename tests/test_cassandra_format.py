@@ -705,13 +705,6 @@ def test_the_extension_chooses_the_format(tmp_path: Path, name: str) -> None:
         files.read(path, {"p": "1"})
 
 
-def test_writing_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
-    path = tmp_path / "new.POMDP"
-    with pytest.raises(ModelError, match=r"writing \.POMDP is not there yet .*write a \.toml"):
-        files.write(read_pomdp(TIGER, "tiger"), path)
-    assert not path.exists()
-
-
 COUNTS: Mapping[str, tuple[int, int, int]] = {
     "tiger.95.POMDP": (2, 3, 2),
     "tiger.aaai.POMDP": (2, 3, 2),

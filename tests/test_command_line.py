@@ -334,6 +334,29 @@ def test_convert_writes_a_model_that_reads_the_same(run_json: Run, folder: Path)
     assert run_json("minimise", "small.dat")["blocks"] == 4
 
 
+@pytest.mark.parametrize("name", ["t.POMDP", "t.pomdpx", "t.PomdpX", "t.dat", "t.SPUDD", "t.TOML"])
+@pytest.mark.parametrize("options", [("--no-tasks",), ("--minimise",)])
+def test_convert_writes_every_format_and_info_reads_it(
+    run_json: Run, folder: Path, name: str, options: tuple[str, ...]
+) -> None:
+    run_json("convert", "tiger", name, *options)
+    found = run_json("info", name)
+    assert (found["states"], found["observability"], len(found["actions"])) == (2, "partial", 3)
+    assert run_json("solve", name)["lower"] == pytest.approx(19.371368, abs=1e-3)
+
+
+def test_convert_lists_states_or_blocks(run_json: Run, folder: Path) -> None:
+    assert run_json("convert", "linear", "blocks.pomdp", "--set", "size=40", "--minimise") == {
+        "file": "blocks.pomdp", "states": 2**40, "blocks": 41,
+    }  # fmt: skip
+    assert run_json("info", "blocks.pomdp")["observability"] == "full"
+    assert run_json("convert", "linear", "flat.mdp", "--set", "size=3", "--no-tasks")["listed"] == 4
+    assert run_json("convert", "nursebot", "n.npz", "--no-tasks")["listed"] > 100
+    assert run_json("convert", "tiger", "t.npz", "--minimise")["blocks"] == 2
+    run_json("convert", "tiger", "later.pomdp", "--minimise", "--first-step")
+    assert run_json("info", "later.pomdp")["states"] == 7  # 2 for each of 3 observations, and the first
+
+
 def test_a_file_wins_over_a_domain_of_the_same_name(run_json: Run, folder: Path) -> None:
     toy = library.load("toy")
     write(toy.model, folder / "copy.toml", toy.tasks)

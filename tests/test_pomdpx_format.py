@@ -1086,14 +1086,13 @@ def test_damaged_documents_raise_nothing_but_model_errors() -> None:
 # -- files -----------------------------------------------------------------------------------------
 
 
-def test_files_are_read_by_extension_and_not_written(tmp_path: Path) -> None:
+def test_files_are_read_and_written_by_extension(tmp_path: Path) -> None:
     path = tmp_path / "tiger.pomdpx"
     path.write_text(TIGER)
     document = read(path)
     assert document.model == read_pomdpx(TIGER, "tiger")
-    with pytest.raises(ModelError, match=r"can be read but not written.*\.toml"):
-        write(document, path)
-    assert path.read_text() == TIGER
+    write(document, tmp_path / "again.PomdpX")
+    assert read(tmp_path / "again.PomdpX").model.states == 2
     write(document, tmp_path / "tiger.toml")
     assert read(tmp_path / "tiger.toml").model.states == 2
     with pytest.raises(ModelError, match="no parameters"):

@@ -12,11 +12,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_dynamics import constant
 from random_models import random_model
+from random_pomdps import random_pomdp
 
+from factored_polca.explicit.alpha_expansion import forward_value
 from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.evaluate import distribution, evaluate
 from factored_polca.explicit.exact_mdp import ExactMDP
+from factored_polca.explicit.exact_pomdp import enumerate_pomdp
 from factored_polca.explicit.minimiser import minimise
 from factored_polca.formats.spudd import read_spudd, read_spudd_with_warnings, write_spudd
 from factored_polca.models import (
@@ -482,7 +486,8 @@ def with_decimals(model: Model) -> Model:
         return tuple(term * 2520 for term in terms)
 
     actions = [
-        Action(a.name, a.effects, applicable=a.applicable, rewards=scaled(a.rewards)) for a in model.actions
+        Action(a.name, a.effects, applicable=a.applicable, rewards=scaled(a.rewards), senses=a.senses)
+        for a in model.actions
     ]
     return replace_fields(model, actions=tuple(actions), rewards=scaled(model.rewards), discount=F(9, 10))
 
@@ -506,6 +511,32 @@ def test_a_pomdp_is_written_and_read_back_unchanged() -> None:
     model = read_spudd(HIDDEN, "m")
     again = read_spudd(write_spudd(model), "m")
     assert again == model
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_written_pomdp_is_read_back_as_the_same(seed: int) -> None:
+    model = with_decimals(random_pomdp(seed))
+    if any(feature.observed for feature in model.features):
+        first = [(f.name, constant(f.values[0])) for f in model.features if f.observed]
+        kept = [d for d in model.initial.distributions if not model.feature(d[0]).observed]
+        model = replace_fields(model, initial=InitialBelief(first + kept * (not model.initial.factors)))
+    ours, theirs = enumerate_pomdp(model), enumerate_pomdp(read_spudd(write_spudd(model), "m"))
+    assert theirs.initial == ours.initial
+    assert theirs.states == ours.states
+    for a in range(len(ours.actions)):
+        for s, ended in enumerate(ours.terminal):
+            row = theirs.kernel[a][s]
+            assert theirs.rewards[a][s] == ours.rewards[a][s]
+            if ended:
+                assert {t for t, _ in row} == {s}
+                continue
+            mine = ours.kernel[a][s]
+            assert sorted((t, p) for (t, _), p in row.items()) == sorted(
+                (t, p) for (t, _), p in mine.items()
+            )
+    arrays, back = ours.to_arrays(), theirs.to_arrays()
+    value = forward_value(arrays, arrays.initial, 3)
+    assert forward_value(back, back.initial, 3) == pytest.approx(value, rel=1e-12)
 
 
 def test_thirds_are_written_as_whole_number_weights() -> None:
@@ -563,8 +594,6 @@ SWITCH = Feature("s", ["on", "off"])
         (Model("m", [Feature("x", ["only"])], [Action("go")]), "two values or more"),
         (Model("m", [SWITCH], [Action("go")], rewards="1/3"), "decimals only"),
         (Model("m", [SWITCH], [Action("go")], discount="1/3"), "decimals only"),
-        (Model("m", [SWITCH], [Action("go")], terminal=SWITCH.is_("on"), observability="partial"),
-         "no terminal states"),
         (Model("m", [Feature("x", [1, 2], observed=True)], [Action("go")], observability="partial"),
          "no observed features"),
         (Model("m", [Feature("x", range(3))], [Action("go", {"x": "x + 1"})]), "none of its values"),

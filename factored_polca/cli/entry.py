@@ -179,6 +179,12 @@ def parser() -> argparse.ArgumentParser:
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
     sub.add_argument("--no-tasks", action="store_true", help="leave the tasks out")
+    sub.add_argument("--minimise", action="store_true", help="write the quotient: a state for each block")
+    sub.add_argument(
+        "--first-step",
+        action="store_true",
+        help="begin a .pomdp file with a step that shows what is seen at first (values times the discount)",
+    )
     return top
 
 

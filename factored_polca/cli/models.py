@@ -12,7 +12,7 @@ from typing import Any
 
 from factored_polca import library
 from factored_polca.cli.output import Output, big, escape, make_table
-from factored_polca.cli.source import UsageError, load
+from factored_polca.cli.source import Source, UsageError, load
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, Value
 from factored_polca.models.expressions import references
 
@@ -252,16 +252,84 @@ def check(arguments: argparse.Namespace, output: Output) -> int:
     return 2 if faults else 0
 
 
+FLAT = (".pomdp", ".mdp", ".npz")
+"""Extensions of files that list states."""
+
+
 def convert(arguments: argparse.Namespace, output: Output) -> int:
-    """Read a model and write it in another format."""
+    """Read a model and write it, or its quotient, in another format."""
     from factored_polca.formats import write
 
     source = load(arguments.model, arguments.set)
     for warning in source.warnings:
         output.warn(str(warning))
-    write(source.model, arguments.output, None if arguments.no_tasks else source.tasks)
-    if arguments.json:
-        output.result({"file": arguments.output, "states": source.model.states})
+    extension = Path(arguments.output).suffix.lower()
+    tasks = None if arguments.no_tasks else source.tasks
+    data: dict[str, Any] = {"file": arguments.output, "states": source.model.states}
+    if tasks is not None and extension in FLAT and not arguments.minimise:
+        held = f"a {extension} file can't hold tasks"
+        raise ModelError([Fault(held, hint="leave them out: --no-tasks", file=arguments.output)])
+    if arguments.minimise:
+        if tasks is not None:
+            output.note("a quotient has no tasks: they are left out")
+        data |= write_quotient(source, arguments, extension, output)
+    elif extension in FLAT:
+        data |= write_flat(source, arguments, extension, output)
     else:
-        output.note(f"{arguments.output} written")
+        write(source.model, arguments.output, tasks)
+    if arguments.json:
+        output.result(data)
+    else:
+        counts = [f"{big(data[key])} {key}" for key in ("blocks", "listed") if key in data]
+        output.note(f"{arguments.output} written{''.join(f' ({text})' for text in counts)}")
     return 0
+
+
+def write_flat(
+    source: Source, arguments: argparse.Namespace, extension: str, output: Output
+) -> dict[str, Any]:
+    """Write a model state by state, those that the start can reach; how many."""
+    from factored_polca.cli.commands import compile_kernels
+    from factored_polca.formats.array_fields import pomdp_fields, write_npz
+    from factored_polca.formats.cassandra import write_pomdp
+    from factored_polca.formats.files import write_text
+    from factored_polca.minimisation.flat_model import flat_model
+    from factored_polca.symbolic import compile_model
+
+    compile_kernels(output)
+    with source.located():
+        flat = flat_model(compile_model(source.model))
+    count = flat.pomdp.states
+    if extension == ".npz":
+        write_npz(pomdp_fields(flat.pomdp), arguments.output)
+    else:
+        texts = [flat.state_text(state) for state in range(count)]
+        first = arguments.first_step and not flat.fully_observed
+        name = source.model.name
+        write_text(arguments.output, lambda: write_pomdp(flat.pomdp, name, texts, first_step=first))
+    return {"listed": count}
+
+
+def write_quotient(
+    source: Source, arguments: argparse.Namespace, extension: str, output: Output
+) -> dict[str, Any]:
+    """Write the quotient of a model, block by block; how many blocks."""
+    from factored_polca.cli.commands import compile_kernels
+    from factored_polca.formats import format_of, write
+    from factored_polca.formats.cassandra import read_pomdp
+    from factored_polca.minimisation import PomdpQuotient, flat_process, reduce
+    from factored_polca.symbolic import compile_model
+
+    if extension != ".npz":
+        format_of(arguments.output)
+    compile_kernels(output)
+    with source.located(), output.progress(f"minimising {source.name}"):
+        quotient = reduce(flat_process(compile_model(source.model))).quotient
+    first = {"first_step": True} if arguments.first_step and isinstance(quotient, PomdpQuotient) else {}
+    if extension == ".npz":
+        quotient.to_npz(arguments.output)
+    elif extension in FLAT:
+        quotient.to_pomdp(arguments.output, **first)
+    else:
+        write(read_pomdp(quotient.to_pomdp_text(**first), source.model.name), arguments.output)
+    return {"blocks": quotient.partition.blocks}

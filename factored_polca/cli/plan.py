@@ -228,7 +228,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         table.add_row(
             escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}",
             f"{sum(c['before'] for c in counts):,} -> {sum(c['after'] for c in counts):,}",
-            *parameters_text(row["parameters"]), f"{row['lower']:.5g} .. {row['upper']:.5g}",
+            *parameters_text(row["parameters"]), f"{brief(row['lower'])} .. {brief(row['upper'])}",
             f"{row['corner_gap']:.2g}", "" if measured is None else measured_text(measured),
             seconds(row["seconds"]),
         )  # fmt: skip
@@ -253,6 +253,11 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         output.line(f"no policy earns more than {data['flat_upper']:.6g} ({escape(data['flat_note'])})")
     output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def brief(value: float) -> str:
+    """Five digits of a number, without what rounding has left of a 0."""
+    return f"{round(value, 9) + 0.0:.5g}"
 
 
 def parameters_text(parameters: dict[str, int | None]) -> list[str]:

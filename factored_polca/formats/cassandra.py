@@ -36,15 +36,26 @@ its sum, with one warning for the file; a larger miss is an error, and so is a t
 observation row that no entry sets.  More lenient than pomdp-solve: numbers such as `.5`, names with
 `.` inside, names that are words of the format, `states: 0 1 2` for `states: 3`, `reset` for a matrix.
 
+Written are arrays, with all states of a model listed or its blocks.  What the format lacks is brought in so
+that every policy keeps its value: see `factored_polca.formats.cassandra_factoring` for observations that
+depend on the state before, observed features and terminal states.
+
 Sources: A. R. Cassandra, "POMDP file format" and "POMDP file grammar", pomdp.org, 1999 to 2005.
 """
 
 from __future__ import annotations
 
+from factored_polca.explicit.exact_pomdp import enumerate_pomdp
 from factored_polca.formats.cassandra_reader import read_pomdp_with_warnings
+from factored_polca.formats.cassandra_writer import write_mdp, write_pomdp
+from factored_polca.models.errors import Fault, LimitReached, ModelError
 from factored_polca.models.model import Model
+from factored_polca.models.scalars import describe, scalar
 
-__all__ = ["read_pomdp", "read_pomdp_with_warnings"]
+__all__ = ["read_pomdp", "read_pomdp_with_warnings", "write_mdp", "write_model", "write_pomdp"]
+
+MAXIMUM_LISTED = 20_000
+"""States of a model that `write_model` lists."""
 
 
 def read_pomdp(text: str, name: str) -> Model:
@@ -55,3 +66,21 @@ def read_pomdp(text: str, name: str) -> Model:
             has a line and a column.
     """
     return read_pomdp_with_warnings(text, name)[0]
+
+
+def write_model(model: Model) -> str:
+    """`model` with all its states listed, in Cassandra's format.
+
+    Raises:
+        ModelError: the model is not right, has more than `MAXIMUM_LISTED` states, or can't be expressed.
+    """
+    try:
+        exact = enumerate_pomdp(model, maximum_states=MAXIMUM_LISTED)
+    except LimitReached:
+        message = f"{model.states} states, which this format lists, are more than {MAXIMUM_LISTED}"
+        raise ModelError([Fault(message, hint="write the quotient: convert --minimise")]) from None
+    shown = [
+        ", ".join(f"{f.name}={describe(scalar(v))}" for f, v in zip(model.features, values, strict=True))
+        for values in exact.state_values
+    ]
+    return write_pomdp(exact.to_arrays(), model.name, shown)

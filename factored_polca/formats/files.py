@@ -51,12 +51,16 @@ def _read_spudd(text: str, overrides: Mapping[str, str], name: str) -> Document:
 
 
 def _write_spudd(document: Document) -> str:
-    if document.tasks is not None:
-        hint = "write a .toml file, or leave the tasks out (--no-tasks)"
-        raise ModelError([Fault("SPUDD's format can't hold tasks", hint=hint)])
+    _refuse_tasks(document, "SPUDD's format")
     from factored_polca.formats.spudd import write_spudd
 
     return write_spudd(document.model)
+
+
+def _refuse_tasks(document: Document, name: str) -> None:
+    if document.tasks is not None:
+        hint = "write a .toml file, or leave the tasks out (--no-tasks)"
+        raise ModelError([Fault(f"{name} can't hold tasks", hint=hint)])
 
 
 def _read_pomdpx(text: str, overrides: Mapping[str, str], name: str) -> Document:
@@ -70,7 +74,10 @@ def _read_pomdpx(text: str, overrides: Mapping[str, str], name: str) -> Document
 
 
 def _write_pomdpx(document: Document) -> str:
-    raise ModelError([Fault("POMDPX can be read but not written yet", hint="write a .toml file")])
+    _refuse_tasks(document, "POMDPX")
+    from factored_polca.formats.pomdpx import write_pomdpx
+
+    return write_pomdpx(document.model)
 
 
 def _read_cassandra(text: str, overrides: Mapping[str, str], name: str) -> Document:
@@ -84,7 +91,10 @@ def _read_cassandra(text: str, overrides: Mapping[str, str], name: str) -> Docum
 
 
 def _write_cassandra(document: Document) -> str:
-    raise ModelError([Fault("writing .POMDP is not there yet", hint="write a .toml or a .dat file")])
+    _refuse_tasks(document, "Cassandra's format")
+    from factored_polca.formats.cassandra import write_model
+
+    return write_model(document.model)
 
 
 _NATIVE: Final = Format("native", _read_native, _write_native)
@@ -178,9 +188,28 @@ def write(document: Document | Model, path: str | Path, tasks: TaskHierarchy | N
         document = Document(document, tasks)
     elif tasks is not None:
         document = Document(document.model, tasks, document.warnings)
+    whole, chosen = document, format_of(path)
+    write_text(path, lambda: chosen.write(whole))
+
+
+def write_text(path: str | Path, make: Callable[[], str]) -> None:
+    """Writes the text that `make` gives; faults of it are told with the file's name.
+
+    Raises:
+        ModelError: `make` raises it, or a folder that can't be written to.
+    """
+    write_bytes(path, lambda: make().encode("utf-8"))
+
+
+def write_bytes(path: str | Path, make: Callable[[], bytes]) -> None:
+    """Writes the bytes that `make` gives; the file appears whole or not at all.
+
+    Raises:
+        ModelError: `make` raises it, or a folder that can't be written to.
+    """
     try:
-        text = format_of(path).write(document)
-        _replace(destination(path), text.encode("utf-8"))
+        data = make()
+        _replace(destination(path), data)
     except ModelError as error:
         raise error.in_file(str(path)) from None
     except OSError as error:

@@ -38,6 +38,9 @@ What becomes what, and how we read where the documentation leaves it open:
 - There are no terminal states: an absorbing state is a state.  <Horizon> is our addition.
 - Elements and attributes that are not listed here are errors, except for attributes of <pomdpx>.
 
+The writer keeps to what APPL's own program reads: tables only, and the arcs that `pomdpx_columns` lists; a
+model with other arcs gets variables for joint values or for values before a step.
+
 Sources: "PomdpX File Format (version 1.0)" and its XML schema, Approximate POMDP Planning Software,
 National University of Singapore; S. C. W. Ong, S. W. Png, D. Hsu, W. S. Lee, "POMDPs for robotic
 tasks with mixed observability", RSS 2009.
@@ -46,9 +49,10 @@ tasks with mixed observability", RSS 2009.
 from __future__ import annotations
 
 from factored_polca.formats.pomdpx_reader import read_pomdpx_with_warnings
+from factored_polca.formats.pomdpx_writer import write_pomdpx
 from factored_polca.models.model import Model
 
-__all__ = ["read_pomdpx", "read_pomdpx_with_warnings"]
+__all__ = ["read_pomdpx", "read_pomdpx_with_warnings", "write_pomdpx"]
 
 
 def read_pomdpx(text: str, name: str) -> Model:

@@ -56,7 +56,8 @@ class ModelTrees:
         self.unnormalised = False
         self.actions = [self._action(action) for action in model.actions]
         self.rewards = [
-            self._reward(term, ("reward", str(index))) for index, term in enumerate(_terms(model.rewards))
+            self._reward(term, ("reward", str(index)))
+            for index, term in enumerate(sum_terms(model.rewards))
         ] or [self.forest.constant(Fraction(0))]
         self.initial = self._initial(model.initial)
 
@@ -74,7 +75,7 @@ class ModelTrees:
             senses[channel.name] = self._rows(expression, channel.name, (*path, "senses", channel.name))
         costs = [
             self._reward(Operation("negate", (term,)), (*path, "reward", str(index)))
-            for index, term in enumerate(_terms(action.rewards))
+            for index, term in enumerate(sum_terms(action.rewards))
         ]
         return ActionTrees(effects, senses, costs)
 
@@ -114,7 +115,7 @@ class ModelTrees:
 
         def leaf(rest: Expression, where: Assignment) -> Expression:
             try:
-                chances = _row(rest, values)
+                chances = row_chances(rest, values)
             except ValueError as problem:
                 message = f"no distribution of {name}{_where(where)}: {problem}"
                 raise ModelError([Fault(message, path)]) from None
@@ -185,7 +186,7 @@ class ModelTrees:
         return scaled
 
 
-def _terms(terms: Iterable[Expression]) -> list[Expression]:
+def sum_terms(terms: Iterable[Expression]) -> list[Expression]:
     """The terms of a sum, sums among them taken apart."""
     found: list[Expression] = []
     for term in terms:
@@ -196,7 +197,7 @@ def _terms(terms: Iterable[Expression]) -> list[Expression]:
     return found
 
 
-def _row(node: Expression, values: tuple[Value, ...]) -> list[Fraction]:
+def row_chances(node: Expression, values: tuple[Value, ...]) -> list[Fraction]:
     """The probabilities of `values` under a distribution that mentions no feature."""
     chances = [Fraction(0)] * len(values)
     outcomes = node.outcomes if isinstance(node, Lottery) else ((node, Constant(Fraction(1))),)

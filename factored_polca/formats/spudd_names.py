@@ -49,7 +49,7 @@ def spell(model: Model) -> Names:
     for variable in variables:
         name = spelled[variable.name]
         wanted = [_value_name(value) for value in variable.values]
-        values[variable.name] = tuple(_distinct_list(wanted, pattern, set(_TAKEN)))
+        values[variable.name] = tuple(distinct_names(wanted, pattern, set(_TAKEN)))
         taken |= {f"SAME{name}", *(f"{name}{value}" for value in values[variable.name])}
         if name != variable.name:
             changed.append(f"{variable.name} is {name}")
@@ -72,10 +72,10 @@ def _value_name(value: Value) -> str:
 
 def _distinct(wanted: Iterable[str], pattern: re.Pattern[str], taken: set[str]) -> dict[str, str]:
     names = list(wanted)
-    return dict(zip(names, _distinct_list(names, pattern, taken), strict=True))
+    return dict(zip(names, distinct_names(names, pattern, taken), strict=True))
 
 
-def _distinct_list(wanted: list[str], pattern: re.Pattern[str], taken: set[str]) -> list[str]:
+def distinct_names(wanted: list[str], pattern: re.Pattern[str], taken: set[str]) -> list[str]:
     """Spellings of `wanted`; those that are fine as they are come first, so that they stay."""
     fine = [len(name) <= _LENGTH and bool(pattern.match(name)) and name not in taken for name in wanted]
     used = taken | {name for name, good in zip(wanted, fine, strict=True) if good}

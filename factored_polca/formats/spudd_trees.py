@@ -125,6 +125,10 @@ class Forest:
         """The number of values of `reference`."""
         return len(self._values[reference.name])
 
+    def values_of(self, reference: Reference) -> tuple[Value, ...]:
+        """The values of `reference`."""
+        return self._values[reference.name]
+
     def constant(self, value: Scalar) -> Expression:
         """The constant `value`."""
         key = ("constant", type(value), value)

@@ -5,7 +5,8 @@ written whose trees stay small.  Rows of an MDP are written as lists of probabil
 examples have them, those of a POMDP as trees over the next value, which Symbolic Perseus needs.  The
 language has decimals only: where a row has a probability such as 1/3, the file says `unnormalised`
 and gives whole-number weights.  It has no terminal states: they are written as absorbing with
-reward 0 for every action, which gives each state the same value.
+reward 0 for every action, which gives each state and belief the same value.  Nor has it observed features:
+where the start leaves no doubt of their value, an observation `see_x` reports x after each step.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from factored_polca.formats.spudd_text import Layout
 from factored_polca.formats.spudd_trees import Assignment, TreeLimit
 from factored_polca.models.check import check
 from factored_polca.models.errors import Fault, ModelError
-from factored_polca.models.expressions import FALSE, TRUE, Expression, Reference
+from factored_polca.models.expressions import TRUE, Constant, Expression, Lottery, Reference
 from factored_polca.models.features import Feature
-from factored_polca.models.model import Model, Observation
+from factored_polca.models.model import Action, Model, Observation, replace_fields
 
 Path = tuple[str, ...]
 Leaf = Callable[[Expression, Assignment], Expression]
@@ -37,6 +38,7 @@ def write_spudd(model: Model) -> str:
     faults = [fault for fault in check(model) if fault.severity == "error"] or list(_refusals(model))
     if faults:
         raise ModelError(faults)
+    model = _with_reports(model)
     try:
         return _text(model, ModelTrees(model))
     except TreeLimit as limit:
@@ -59,12 +61,47 @@ def _refusals(model: Model) -> Iterable[Fault]:
     if model.observability == "full":
         return
     for feature in model.features:
-        if feature.observed:
-            yield Fault("the language has no observed features", ("features", feature.name),
-                        "add an observation that reports it")  # fmt: skip
-    if model.terminal != FALSE:
-        yield Fault("the language has no terminal states, and in a POMDP an absorbing state is not the "
-                    "same, for termination is observed", ("terminal",), native)  # fmt: skip
+        if feature.observed and not _foretold(model, feature):
+            message = "the language has no observed features, and no observation before the first action"
+            hint = f"give {feature.name} one value at the start: an observation will report it from then on"
+            yield Fault(message, ("features", feature.name), hint)
+
+
+def _foretold(model: Model, feature: Feature) -> bool:
+    """Whether the initial belief gives `feature` one value, written as such."""
+    given = dict(model.initial.distributions).get(feature.name)
+    if isinstance(given, Lottery):
+        return len(given.outcomes) == 1
+    return isinstance(given, Constant)
+
+
+def _with_reports(model: Model) -> Model:
+    """`model` with an observation for each observed feature of a partially observed model."""
+    observed = [f for f in model.features if f.observed]
+    if model.observability == "full" or not observed:
+        return model
+    taken = {f.name for f in model.features} | {o.name for o in model.observations}
+    names = {}
+    for feature in observed:
+        name = f"see_{feature.name}"
+        while name in taken:
+            name += "_"
+        taken.add(name)
+        names[feature.name] = name
+    channels = [Observation(names[f.name], f.values, null=f.values[0]) for f in observed]
+    actions = [
+        Action(
+            a.name,
+            a.effects,
+            applicable=a.applicable,
+            rewards=a.rewards,
+            senses=[*a.senses, *((names[f.name], f.next) for f in observed)],
+        )
+        for a in model.actions
+    ]
+    features = tuple(Feature(f.name, f.values) for f in model.features)
+    observations = (*model.observations, *channels)
+    return replace_fields(model, features=features, actions=tuple(actions), observations=observations)
 
 
 def _text(model: Model, trees: ModelTrees) -> str:

@@ -16,7 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import FloatArray, Int32Array, Int64Array
 from factored_polca.minimisation.quotient import (
     as_float,
+    block_texts,
     distinct_rewards,
     exact_rewards,
     feature_states,
@@ -129,6 +131,46 @@ class PomdpQuotient:
             return Fraction(0)
         state = feature_states(self.partition)[block : block + 1]
         return exact_rewards(self.process, primitive, state)[0]
+
+    def to_arrays(self, *, dense: bool = False) -> dict[str, Any]:
+        """The quotient as plain arrays by name; see `factored_polca.formats.array_fields`."""
+        from factored_polca.formats.array_fields import pomdp_fields
+
+        return pomdp_fields(self.pomdp, dense=dense)
+
+    def to_npz(self, path: str | Path) -> None:
+        """Write the arrays to a file in numpy's format .npz; it appears whole or not at all.
+
+        Raises:
+            ModelError: the file can't be written.
+        """
+        from factored_polca.formats.array_fields import pomdp_fields, write_npz
+
+        write_npz(pomdp_fields(self.pomdp), path)
+
+    def to_pomdp(self, path: str | Path, *, first_step: bool = False) -> None:
+        """Write the quotient as a file in Cassandra's format; it appears whole or not at all.
+
+        With `first_step` it begins a step earlier, which shows what is seen of the state at the start;
+        all values there are then multiplied by the discount.
+
+        Raises:
+            ModelError: the format can't express it, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, lambda: self.to_pomdp_text(first_step=first_step))
+
+    def to_pomdp_text(self, *, first_step: bool = False) -> str:
+        """The text that `to_pomdp` writes.
+
+        Raises:
+            ModelError: the format can't express it.
+        """
+        from factored_polca.formats.cassandra import write_pomdp
+
+        name, texts = self.process.symbolic.model.name, block_texts(self.partition)
+        return write_pomdp(self.pomdp, name, texts, first_step=first_step)
 
 
 def make_pomdp_quotient(

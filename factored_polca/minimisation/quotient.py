@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,48 @@ class Quotient:
             return Fraction(0)
         states = feature_states(self.partition)[block : block + 1]
         return exact_rewards(self.process, primitive, states)[0]
+
+    def to_arrays(self, *, dense: bool = False) -> dict[str, Any]:
+        """The quotient as plain arrays by name; see `factored_polca.formats.array_fields`."""
+        from factored_polca.formats.array_fields import mdp_fields
+
+        return mdp_fields(self.mdp, initial_distribution(self.partition), dense=dense)
+
+    def to_npz(self, path: str | Path) -> None:
+        """Write the arrays to a file in numpy's format .npz; it appears whole or not at all.
+
+        Raises:
+            ModelError: the file can't be written.
+        """
+        from factored_polca.formats.array_fields import mdp_fields, write_npz
+
+        write_npz(mdp_fields(self.mdp, initial_distribution(self.partition)), path)
+
+    def to_pomdp(self, path: str | Path) -> None:
+        """Write the quotient as a file in Cassandra's format; it appears whole or not at all.
+
+        Raises:
+            ModelError: a choice does not apply everywhere, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, self.to_pomdp_text)
+
+    def to_pomdp_text(self) -> str:
+        """The text that `to_pomdp` writes.
+
+        Raises:
+            ModelError: a choice does not apply everywhere.
+        """
+        from factored_polca.formats.cassandra import write_mdp
+
+        name, initial = self.process.symbolic.model.name, initial_distribution(self.partition)
+        return write_mdp(self.mdp, initial, name, block_texts(self.partition))
+
+
+def block_texts(partition: Partition) -> list[str]:
+    """A representative of each block as `x=3, y=on`."""
+    return [partition.symbolic.state_text(levels) for levels in partition.representatives.tolist()]
 
 
 def feature_states(partition: Partition) -> npt.NDArray[np.int32]:

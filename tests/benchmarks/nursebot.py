@@ -27,6 +27,7 @@ SIZES = [
     {"topics": 16},
     {"patients": 2},
     {"patients": 4},
+    {"patients": 6},
     {"patients": 8},
 ]
 
