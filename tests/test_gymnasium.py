@@ -193,7 +193,7 @@ def test_toy_texts_have_the_values_of_their_tables(name: str, settings: Any) -> 
     assert reduction.project_initial() @ solution.values == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_older_taxi_is_the_same() -> None:
+def test_an_environment_without_a_registered_name_is_read_too() -> None:
     from gymnasium.envs.toy_text.taxi import TaxiEnv
 
     found = model_of(TaxiEnv(), discount="19/20", name="Taxi")
