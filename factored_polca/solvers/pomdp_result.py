@@ -89,5 +89,6 @@ class POMDPSolution:
 
     @property
     def converged(self) -> bool:
-        """Whether the gap that was asked for was reached."""
+        """Whether the gap that was asked for was reached; of QMDP, FIB, AMDP and blind policies, which close
+        none, whether they came to their end."""
         return self.status == "converged"
