@@ -23,7 +23,16 @@ if TYPE_CHECKING:
     from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit
     from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
     from factored_polca.formats import Document, read, write
-    from factored_polca.hierarchy import HierarchicalPlan, Options, SolvedTask, plan
+    from factored_polca.hierarchy import (
+        HierarchicalPlan,
+        Options,
+        PomdpPlan,
+        SolvedPomdpTask,
+        SolvedTask,
+        plan,
+        plan_mdp,
+        plan_pomdp,
+    )
     from factored_polca.hierarchy.executable import ExecutablePlan, executable
     from factored_polca.hierarchy.plan_file import load_plan, save_plan
     from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
@@ -78,7 +87,10 @@ _HOME: Final = {
     "diagrams": ("Aborted", "Diagram", "Manager", "MemoryLimit"),
     "explicit.pomdp_arrays": ("ArrayPOMDP", "array_pomdp"),
     "formats": ("Document", "read", "write"),
-    "hierarchy": ("HierarchicalPlan", "Options", "SolvedTask", "plan"),
+    "hierarchy": (
+        "HierarchicalPlan", "Options", "PomdpPlan", "SolvedPomdpTask", "SolvedTask", "plan", "plan_mdp",
+        "plan_pomdp",
+    ),
     "hierarchy.executable": ("ExecutablePlan", "executable"),
     "hierarchy.plan_file": ("load_plan", "save_plan"),
     "hierarchy.pomdp_executable": ("ExecutablePomdpPlan", "executable_pomdp"),
@@ -115,14 +127,15 @@ __all__ = [
     "Certificate", "Controller", "Decision", "Demand", "Diagram", "Document", "ExecutablePlan",
     "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
     "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation", "Model",
-    "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpSolver",
-    "Reduction", "Simulation", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "__version__",
-    "alpha_vectors", "array_pomdp", "boolean", "certify", "check", "check_tasks", "choose_tracker",
-    "compile_model", "conditional", "domains", "executable", "executable_pomdp", "flat_process",
-    "independent_belief", "load_domain", "load_plan", "load_pomdp_plan", "lottery", "measure",
-    "minimise", "plan", "plan_report", "plan_tracker", "reachable_states", "read", "reduce",
-    "save_plan", "save_pomdp_plan", "simulate", "solution_of_actions", "solution_of_policy",
-    "solve_mdp", "solve_pomdp", "uniform", "unreduced_pomdp", "write",
+    "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpPlan",
+    "PomdpSolver", "Reduction", "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task",
+    "TaskHierarchy", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify", "check",
+    "check_tasks", "choose_tracker", "compile_model", "conditional", "domains", "executable",
+    "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan",
+    "load_pomdp_plan", "lottery", "measure", "minimise", "plan", "plan_mdp", "plan_pomdp",
+    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "save_plan",
+    "save_pomdp_plan", "simulate", "solution_of_actions", "solution_of_policy", "solve_mdp",
+    "solve_pomdp", "uniform", "unreduced_pomdp", "write",
 ]  # fmt: skip
 
 

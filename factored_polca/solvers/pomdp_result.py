@@ -89,6 +89,8 @@ class POMDPSolution:
 
     @property
     def converged(self) -> bool:
-        """Whether the gap that was asked for was reached; of QMDP, FIB, AMDP and blind policies, which close
-        none, whether they came to their end."""
+        """Whether the gap that was asked for was reached.
+
+        Of QMDP, FIB, AMDP and blind policies, which close no gap: whether they came to their end.
+        """
         return self.status == "converged"
