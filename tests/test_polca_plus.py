@@ -32,6 +32,7 @@ from factored_polca.hierarchy import (
 )
 from factored_polca.hierarchy.parameters import pomdp_parameters
 from factored_polca.hierarchy.pomdp_plan import refuse_unplannable
+from factored_polca.hierarchy.pomdp_report import task_guarantee
 from factored_polca.hierarchy.subtask import planning_channels, subtask_process
 from factored_polca.library import load
 from factored_polca.minimisation import minimise
@@ -369,6 +370,7 @@ def test_a_task_may_plan_with_fewer_observations_and_says_so() -> None:
     assert deaf.root.lower == pytest.approx(-20, abs=1e-6)
     assert deaf.root.upper == pytest.approx(-20, abs=1e-5)
     assert any("lower bound" in warning for warning in deaf.warnings)
+    assert "can earn more" in task_guarantee(deaf.root)
     assert hears.root.upper >= 19.37
 
 

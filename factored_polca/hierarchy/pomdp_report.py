@@ -67,12 +67,13 @@ def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
         "observations": {
             name: {"before": before[c], "after": after[c]} for c, name in enumerate(solved.task.actions)
         },
+        "observes": None if solved.task.observes is None else list(solved.task.observes),
         "lower": solved.lower,
         "upper": solved.upper,
         "corner_gap": solved.corner_gap,
         "solver": solution.method,
         "status": solution.status,
-        "guarantee": solution.guarantee.text,
+        "guarantee": task_guarantee(solved),
         "vectors": solution.vectors,
         "iterations": solution.iterations,
         "ties": solved.ties,
@@ -80,6 +81,14 @@ def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
         "minimise_seconds": solved.minimise_seconds,
         "seconds": solved.seconds,
     }
+
+
+def task_guarantee(solved: SolvedPomdpTask) -> str:
+    """How far the bounds of a task may be trusted, in words."""
+    text = solved.solution.guarantee.text
+    if solved.task.observes is None:
+        return text
+    return f"{text}; with all that it will observe the task can earn more than it plans to"
 
 
 def guarantee(plan: PomdpPlan) -> str:
