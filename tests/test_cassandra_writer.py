@@ -223,14 +223,3 @@ def test_rows_of_rounded_floats_sum_to_exactly_one() -> None:
             key = " ".join(row)
             rows[key] = rows.get(key, Fraction(0)) + Fraction(number)
     assert set(rows.values()) == {Fraction(1)}
-
-
-def test_beside_a_single_observation_stands_one_that_never_occurs() -> None:
-    """pomdp-solve 5.5 ends in its first epoch where there is only one."""
-    blind = array_pomdp(
-        [[np.array([[0.5, 0.5], [0.0, 1.0]])]], np.array([[1.0, 0.0]]), np.array([1.0, 0.0]), 0.9
-    )
-    text = write_pomdp(blind)
-    (listed,) = [line for line in text.splitlines() if line.startswith("observations:")]
-    assert len(listed.split()) == 3
-    assert listed.split()[2] not in [line.split()[5] for line in text.splitlines() if line.startswith("O:")]

@@ -61,10 +61,7 @@ def write_mdp(
 
 
 def write_factored(arrays: FactoredArrays, name: str = "", states: Sequence[str] | None = None) -> str:
-    """Arrays with T and O apart in Cassandra's format.
-
-    Beside a single observation stands one that never occurs: pomdp-solve ends with an error without it.
-    """
+    """Arrays with T and O apart in Cassandra's format."""
     return "\n".join(_lines(arrays, name, states)) + "\n"
 
 
@@ -102,8 +99,7 @@ def _lines(arrays: FactoredArrays, name: str, states: Sequence[str] | None) -> I
     yield f"states: {arrays.states}"
     yield f"actions: {' '.join(actions)}"
     if arrays.observations is not None:
-        listed = labels if len(labels) > 1 else [*labels, "never" if labels[0] != "never" else "unused"]
-        yield f"observations: {' '.join(listed)}"
+        yield f"observations: {' '.join(labels)}"
     yield f"start: {' '.join(float_row_texts(arrays.initial.tolist()))}"
     for a, action in enumerate(actions):
         yield from _rows(f"T: {action}", arrays.transitions[a], range(arrays.states))
