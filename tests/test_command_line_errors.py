@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from factored_polca.cli import commands, main
-from factored_polca.cli.entry import size
+from factored_polca.cli.argument_types import size
 from factored_polca.diagrams import MemoryLimit
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -39,9 +39,22 @@ MAY_IMPORT: dict[str, set[str]] = {
     "external": {"simulation", "solvers", "formats", "explicit", *SYMBOLIC},
     # the kit for other packages' tests reads everything that it checks
     "testing": {"simulation", "control", *HIERARCHY},
-    "studies": {"simulation", "control", "library", *HIERARCHY},
+    "studies": {"display", "baselines", "simulation", "control", "library", *HIERARCHY},
+    "baselines": {"simulation", "control", *HIERARCHY},
+    "display": {"simulation", "control", "library", *HIERARCHY},
+    # what runs other models, whole programs and peers, and draws what came of it
+    "bench": {
+        "studies",
+        "external",
+        "display",
+        "baselines",
+        "simulation",
+        "control",
+        "library",
+        *HIERARCHY,
+    },
     # from the top package: the version
-    "cli": {"studies", "simulation", "control", "library", "", *HIERARCHY},
+    "cli": {"bench", "studies", "display", "baselines", "simulation", "control", "library", "", *HIERARCHY},
     "__main__": {"cli"},
 }
 
