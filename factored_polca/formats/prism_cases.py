@@ -28,7 +28,6 @@ from factored_polca.models.expressions import (
     Operation,
     Reference,
     Switch,
-    children,
     operation,
     parts_first,
     references,
@@ -52,6 +51,10 @@ class Known:
     def of(self, feature: Feature) -> tuple[Value, ...]:
         """The values that are left."""
         return dict(self.values).get(feature.name, feature.values)
+
+    def singles(self) -> dict[Reference, Expression]:
+        """The features that have one value."""
+        return {Reference(name): Constant(scalar(v[0])) for name, v in self.values if len(v) == 1}
 
     def where(self, name: str, values: tuple[Value, ...]) -> Known:
         """And `name` has one of `values`."""
@@ -85,9 +88,10 @@ class Cases:
                     "use a .toml file"
                 )
             if isinstance(e, Conditional):
+                condition = substitute(e.condition, known.singles())
                 stack += [
                     (below, e.then if holds else e.otherwise)
-                    for below, holds in self.split(known, e.condition)
+                    for below, holds in self.split(known, condition)
                 ]
             elif isinstance(e, Switch) and not e.reference.primed:
                 feature = self.features[e.reference.name]
@@ -100,8 +104,10 @@ class Cases:
                     stack += [
                         (known.where(feature.name, tuple(v)), part) for part, v in reversed(groups.items())
                     ]
+            elif (inner := _decision_in(e)) is not None:
+                stack.append((known, inner))
             else:
-                yield known, e
+                yield known, substitute(e, known.singles())
 
     def split(self, known: Known, condition: Expression) -> list[tuple[Known, bool]]:
         """A region where a condition holds and where it does not; only one of them if it is decided."""
@@ -138,7 +144,7 @@ class Cases:
         known, before = region
         parts: list[tuple[Known, list[Outcome]]] = [(known, [])]
         for chance, given in before:
-            expression = substitute(effect, given)
+            expression = substitute(effect, next_values(given))
             divided = []
             for inside, outcomes in parts:
                 for below, end in self.regions(expression, inside):
@@ -155,6 +161,24 @@ class Cases:
                     divided.append((below, [*outcomes, *added]))
             parts = divided
         return parts
+
+
+def _decision_in(e: Expression) -> Expression | None:
+    """A lottery one of whose probabilities is a conditional, as a conditional of lotteries."""
+    if not isinstance(e, Lottery):
+        return None
+    for index, (value, chance) in enumerate(e.outcomes):
+        if isinstance(chance, Conditional):
+            before, after = e.outcomes[:index], e.outcomes[index + 1 :]
+            then, otherwise = (
+                Lottery((*before, (value, part), *after)) for part in (chance.then, chance.otherwise)
+            )
+            return Conditional(chance.condition, then, otherwise)
+    return None
+
+
+def next_values(values: Mapping[str, Expression]) -> dict[Reference, Expression]:
+    return {Reference(name, primed=True): value for name, value in values.items()}
 
 
 def _row(end: Expression) -> Sequence[tuple[Expression, Expression]]:
@@ -189,17 +213,15 @@ def case_of(e: Switch, value: Value) -> Expression:
     return e.otherwise
 
 
-def substitute(e: Expression, values: Mapping[str, Expression]) -> Expression:
-    """`e` with next values put in, folded where that decides."""
-    if not any(r.primed and r.name in values for r in references(e)):
+def substitute(e: Expression, values: Mapping[Reference, Expression]) -> Expression:
+    """`e` with what stands for some references put in, folded where that decides."""
+    if not values or not references(e) & set(values):
         return e
     new: dict[Expression, Expression] = {}
     for part in parts_first(e):
-        if not children(part):
-            found = values.get(part.name) if isinstance(part, Reference) and part.primed else None
-            new[part] = part if found is None else found
-            continue
         match part:
+            case Reference():
+                new[part] = values.get(part, part)
             case Operation():
                 parts = [new[a] for a in part.arguments]
                 is_logical = part.operator in ("and", "or", "not")
@@ -210,6 +232,8 @@ def substitute(e: Expression, values: Mapping[str, Expression]) -> Expression:
                 new[part] = Lottery(tuple((new[v], new[q]) for v, q in part.outcomes))
             case Switch():
                 new[part] = _switched(part, new)
+            case _:
+                new[part] = part
     return new[e]
 
 
@@ -222,6 +246,12 @@ def _switched(e: Switch, new: Mapping[Expression, Expression]) -> Expression:
     if isinstance(reference, Reference):
         otherwise = None if e.otherwise is None else new[e.otherwise]
         return Switch(reference, tuple((value, new[case]) for value, case in e.cases), otherwise)
+    if isinstance(reference, Constant):
+        for value, case in e.cases:
+            if Constant(scalar(value)) == reference:
+                return new[case]
+        if e.otherwise is not None:
+            return new[e.otherwise]
     cases = [(value, new[case]) for value, case in e.cases]
     if e.otherwise is None:
         *cases, (_, result) = cases

@@ -10,25 +10,32 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
+import selectors
 import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from factored_polca.formats.prism_text import Place
 from factored_polca.models.errors import Fault, ModelError
 
 SECONDS: Final = 60
 """Processor seconds that the parser may take."""
+WAITING: Final = 300.0
+"""Seconds of waiting for it, however busy the machine."""
 MEGABYTES: Final = 4096
 """Address space of the parser."""
 MAXIMUM_ANSWER: Final = 256 * 2**20
+
+CHILD: Final = Path(__file__).with_name("prism_child.py")
 
 NEEDED: Final = "reading PRISM needs stormpy 2, which is an extra: pip install 'factored-polca[storm]'"
 
@@ -94,8 +101,7 @@ def parse_program(text: str, original: Callable[[int, int], Place]) -> RawProgra
 
 def _run(folder: Path) -> tuple[bytes, int]:
     """What the child prints, as much of it as is read, and its exit status."""
-    child = Path(__file__).with_name("prism_child.py")
-    command = [sys.executable, "-I", str(child), "model.prism", str(SECONDS), str(MEGABYTES)]
+    command = [sys.executable, "-I", str(CHILD), "model.prism", str(SECONDS), str(MEGABYTES)]
     with (folder / "said").open("wb") as said:
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said,
@@ -103,19 +109,40 @@ def _run(folder: Path) -> tuple[bytes, int]:
         )  # fmt: skip
         assert process.stdout is not None
         try:
-            answer = process.stdout.read(MAXIMUM_ANSWER + 1)
-            if len(answer) > MAXIMUM_ANSWER:
-                raise ModelError(
-                    f"the program is too large: written out it has more than {MAXIMUM_ANSWER} bytes"
-                )
-            return answer, process.wait(timeout=SECONDS)
-        except subprocess.TimeoutExpired:
+            answer = _answer(process.stdout, time.monotonic() + WAITING)
+            return answer, process.wait(timeout=WAITING)
+        except (subprocess.TimeoutExpired, TimeoutError):
             return b"", -signal.SIGXCPU
         finally:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             process.stdout.close()
             process.wait()
+
+
+def _answer(stream: IO[bytes], deadline: float) -> bytes:
+    """What a child writes until it ends.
+
+    Raises:
+        TimeoutError: it has not ended at the deadline.
+        ModelError: it writes too much.
+    """
+    parts: list[bytes] = []
+    length = 0
+    with selectors.DefaultSelector() as selector:
+        selector.register(stream, selectors.EVENT_READ)
+        while True:
+            if not selector.select(max(0.0, deadline - time.monotonic())):
+                raise TimeoutError
+            part = os.read(stream.fileno(), 1 << 20)
+            if not part:
+                return b"".join(parts)
+            parts.append(part)
+            length += len(part)
+            if length > MAXIMUM_ANSWER:
+                raise ModelError(
+                    f"the program is too large: written out it has more than {MAXIMUM_ANSWER} bytes"
+                )
 
 
 def _ending(code: int) -> str:

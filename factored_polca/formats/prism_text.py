@@ -295,7 +295,7 @@ class _Walk:
         while True:
             token = self.peek()
             self.at += 1
-            if token.kind == "end" or token.text in _WORDS:
+            if token.kind == "end" or token.text in _WORDS or (token.text == ";" and stop != ";"):
                 found_text = repr(token.text[:40]) if token.text else "the end"
                 raise _error(self.scan, f"expected {stop!r} in a reward, found {found_text}", token.start)
             if token.text == "->":

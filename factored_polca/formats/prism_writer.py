@@ -23,7 +23,7 @@ from fractions import Fraction
 
 import networkx as nx
 
-from factored_polca.formats.prism_cases import Cases, Known, Outcome, substitute
+from factored_polca.formats.prism_cases import Cases, Known, Outcome, next_values, substitute
 from factored_polca.formats.prism_guards import Guards
 from factored_polca.formats.prism_spelling import NotDirect, Spelling, number_text
 from factored_polca.formats.spudd_trees import Assignment, ExpansionLimit, Forest, TreeLimit
@@ -265,7 +265,9 @@ class _Writer:
                 effects = [(name, Reference(name)) for name in sorted(persisting)] + effects
                 for known, outcomes in self.cases.joint(effects, Known()):
                     for chance, values in outcomes:
-                        yield from self.reward(label, [], substitute(term, values), known, chance)
+                        yield from self.reward(
+                            label, [], substitute(term, next_values(values)), known, chance
+                        )
 
     def ancestors(self, action: Action, names: Iterable[str]) -> set[str]:
         """Features whose next values decide those of some."""
