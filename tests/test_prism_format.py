@@ -180,6 +180,23 @@ def test_a_deadlock_stays_and_a_terminal_state_ends() -> None:
 
 
 @with_storm
+def test_a_command_is_not_enabled_where_it_would_leave_a_range() -> None:
+    text = """mdp module m x : [0..2]; busy : bool;
+    [up] busy -> 1/2:(x'=x+1) + 1/2:(busy'=false);
+    [down] busy -> (x=0 ? 0 : 1/3):(x'=x-1) + (x=0 ? 1 : 2/3):true; endmodule"""
+    model, warnings, _ = read_prism(text, {"discount": "0.9"})
+    (place,) = [(w.line, w.column) for w in warnings if "out of its range" in w.message]
+    assert place == (2, 5)  # the other command has probability 0 there
+    mdp = enumerate_model(model)
+    enabled = {
+        name: [values for s, values in enumerate(mdp.state_values) if mdp.applicable[a][s]]
+        for a, name in enumerate(mdp.actions)
+    }
+    assert enabled["up"] == [(0, True), (1, True)]
+    assert enabled["down"] == [(0, True), (1, True), (2, True)]
+
+
+@with_storm
 def test_init_is_uniform_over_its_states() -> None:
     text = """mdp
     module m x : [0..3]; y : [0..1]; z : [0..2]; b : bool; [a] true -> (z'=0); endmodule

@@ -111,6 +111,7 @@ class _Assembly:
             return [choose(item.guard, sign * item.value, ZERO) for item in items]
 
         actions = Actions(program, terminal)
+        self.warnings += actions.warnings
         chain = program.kind == "dtmc"
         made = [(actions.of_dtmc(own), (0, 0))] if chain else list(actions.of_mdp(own))
         for action, place in made:

@@ -26,6 +26,7 @@ from factored_polca.formats.prism_expressions import choose
 from factored_polca.formats.prism_guards import Guards
 from factored_polca.formats.prism_outcomes import Outcome, effects_of, product
 from factored_polca.formats.prism_program import Command, Program
+from factored_polca.formats.prism_ranges import inside_bounds
 from factored_polca.formats.prism_text import Place
 from factored_polca.models.errors import Fault, ModelError
 from factored_polca.models.expressions import (
@@ -115,14 +116,25 @@ class Actions:
         self.guards = Guards(program.features, program.parameters)
         self.features = {feature.name: feature for feature in program.features}
         self.order = list(self.features)
+        self.warnings: list[Fault] = []
+        self.modules = tuple(
+            (name, tuple(self._inside(command) for command in commands))
+            for name, commands in program.modules
+        )
         self.choices = list(self._choices())
+
+    def _inside(self, command: Command) -> Command:
+        result, warning = inside_bounds(command, self.features, self.guards)
+        if warning is not None:
+            self.warnings.append(warning)
+        return result
 
     # -- choices ---------------------------------------------------------------------------------
 
     def _choices(self) -> Iterator[Choice]:
         labelled: dict[str, dict[str, list[Command]]] = {}  # label -> module -> commands
         lone: list[Command] = []
-        for module, commands in self.program.modules:
+        for module, commands in self.modules:
             for command in commands:
                 if command.guard == FALSE:
                     continue
@@ -133,7 +145,7 @@ class Actions:
         having = {
             label: [
                 module
-                for module, commands in self.program.modules
+                for module, commands in self.modules
                 if any(command.label == label for command in commands)
             ]
             for label in labelled

@@ -142,7 +142,7 @@ def logical(name: str, parts: Sequence[Expression]) -> Expression:
             else operation("not", part)
         )
     decides = Constant(name == "or")
-    kept = [part for part in parts if part != Constant(name == "and")]
+    kept = [part for part in dict.fromkeys(parts) if part != Constant(name == "and")]
     if decides in kept:
         return decides
     return operation(name, *kept) if kept else Constant(name == "and")
