@@ -35,9 +35,12 @@ from factored_polca.diagrams.nodes import (
 (
     FIELD_ADD, FIELD_SUBTRACT, FIELD_MULTIPLY,
     FLOAT_ADD, FLOAT_SUBTRACT, FLOAT_MULTIPLY, FLOAT_MINIMUM, FLOAT_MAXIMUM, FLOAT_LESS,
-    AND, OR, XOR, DIFFERENCE, EQUAL, PAIR,
-) = range(1, 16)  # fmt: skip
-"""Operator codes."""
+    AND, OR, XOR, DIFFERENCE, EQUAL, PAIR, OVERRIDE,
+) = range(1, 17)  # fmt: skip
+"""Operator codes.  OVERRIDE(a, b) is b where the index a is 0, else a - 1; its left identity is 0."""
+
+PAIR_TOUCHED = 17
+"""A key for the computed cache, not a code: PAIR with 0 as right absorbing element."""
 
 CODE, LEFT_IDENTITY, RIGHT_IDENTITY, LEFT_ABSORBING, RIGHT_ABSORBING, COMMUTES, SAME, KEY = range(8)
 """Places in the row of integers that describes an operator to the kernel: nodes, or 0 for none.
@@ -177,13 +180,15 @@ def apply_binary(
         if r == 0:
             la = pool[a]
             lb = pool[b]
-            if la == leaf_level and lb == leaf_level:
+            if la == leaf_level and (lb == leaf_level or code == OVERRIDE):
                 if code == EQUAL:
                     value = _ZERO
                 elif AND <= code <= DIFFERENCE:
                     return INVALID
                 elif code == PAIR:
                     value = (np.uint64(a) << _S32) | np.uint64(b)
+                elif code == OVERRIDE:
+                    value = payload(pool, a) - _ONE
                 else:
                     value = leaf_value(code, payload(pool, a), payload(pool, b), field[0], field[1])
                 words[0] = np.int32(value & _LOW)

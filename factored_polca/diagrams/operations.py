@@ -389,7 +389,7 @@ def weighted_sum(
     for v, (weight, term) in enumerate(zip(weights, terms, strict=True)):
         buffer[2 * v] = weight.node
         buffer[2 * v + 1] = term.node
-    manager.stack[:4] = (0, len(weights), -1, 0)
+    manager.stack[:5] = (0, len(weights), -1, 0, normalised)
     state = np.array([1, 0, STEPS], dtype=np.int64)
 
     def step() -> int:
