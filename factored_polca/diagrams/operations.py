@@ -78,10 +78,18 @@ def apply(name: str, a: Diagram, b: Diagram) -> Diagram:
     manager.safe_point()
     result_type = INDEX if row.gives == "boolean" else a.leaf_type
     field = a.leaf_type.parameters if isinstance(a.leaf_type, Field) else _NO_FIELD
-    op = manager.operator_rows.get((name, a.leaf_type))
-    if op is None:
-        op = manager.operator_rows[name, a.leaf_type] = _kernel_row(manager, row, a.leaf_type, result_type)
+    op = operator_row(manager, name, row, a.leaf_type, result_type)
     return manager.handle(_run_binary(manager, op, field, a, b), result_type)
+
+
+def operator_row(
+    manager: Manager, name: str, row: OperatorRow, leaf_type: LeafType, result_type: LeafType
+) -> npt.NDArray[np.int64]:
+    """The operator as `apply_binary` takes it, until the next collection."""
+    op = manager.operator_rows.get((name, leaf_type))
+    if op is None:
+        op = manager.operator_rows[name, leaf_type] = _kernel_row(manager, row, leaf_type, result_type)
+    return op
 
 
 def _kernel_row(
