@@ -78,9 +78,9 @@ class NumericView:
 
     def weights(self, action: int, feature: int) -> list[Diagram]:
         """P_a(x_i' = v | parents) for each v."""
-        key = (action, feature)
+        row = self.symbolic.actions[action].rows.get(feature)
+        key = (-1, feature) if row is None else (id(row.diagram), id(row.rows))  # actions share them
         if key not in self._weights:
-            row = self.symbolic.actions[action].rows.get(feature)
             if row is None:
                 level = self.symbolic.now(feature)
                 size = len(self.symbolic.model.features[feature].values)
