@@ -24,7 +24,7 @@ from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.compiled import kernel
 
 LOST: Final = 1e-12
-STEPS: Final = 3_000
+STEPS: Final = 1_000
 
 
 class Paths(NamedTuple):

@@ -87,7 +87,7 @@ def full_table(name: str, rows: int, live: BoolArray) -> Table:
 def stored(table: TableArrays, row: int, state: int) -> float:
     """A value; 0 where it is not stored."""
     entry = table.entries[row, state]
-    return table.values[entry] if entry >= 0 else 0.0  # type: ignore[no-any-return]
+    return table.values[entry] if entry >= 0 else 0.0
 
 
 @kernel
