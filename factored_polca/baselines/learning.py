@@ -37,6 +37,8 @@ EPISODES: Final = 40_000
 STEP_LIMIT: Final = 5_000
 """Steps after which an episode is broken off."""
 RATE_POWER: Final = 0.51
+BATCH: Final = 1_000
+"""Episodes that one call of a kernel learns from; Ctrl-C is seen between calls."""
 CLOSE: Final = 0.02
 """How close to the optimal return counts as there, relative to it."""
 
@@ -65,7 +67,7 @@ Episodes = Callable[
 GreedyChoice = Callable[[GraphArrays, tuple[TableArrays, ...], IntArray], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Method:
     """A learner: its task graph, its tables, and the two kernels that fill and read them."""
 
@@ -105,7 +107,7 @@ class Schedule:
         return sorted({*np.rint(spread).astype(int).tolist(), self.episodes})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Learned:
     """What came of learning.
 
@@ -161,14 +163,19 @@ def learn(
     tables = tuple(table.empty() for table in method.tables)
     count = schedule.episodes
     record = Record(np.zeros(count), np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64))
-    choice = np.full(method.graph.arrays.over.shape, NONE, dtype=np.int64)
+    graph = method.graph.arrays
+    choice = np.full(graph.over.shape, NONE, dtype=np.int64)
     optimum = float(process.initial @ optimal)
     greedy, training, done = [], [], 0
     for point in schedule.points():
-        method.episodes(process.arrays, method.graph.arrays, tables, knobs, done, point, record, generator)
+        for begin in range(done, point, BATCH):
+            end = min(begin + BATCH, point)
+            method.episodes(
+                process.arrays, method.graph.arrays, tables, knobs, begin, end, record, generator
+            )
         lost = record.returns[done:point] - optimal[record.starts[done:point]]
         training.append(optimum + float(lost.mean()))
-        method.greedy(method.graph.arrays, tables, choice)
+        method.greedy(graph, tables, choice)
         greedy.append(return_of_greedy(process, method.graph, choice))
         done = point
         if progress is not None:

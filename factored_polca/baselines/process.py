@@ -39,7 +39,7 @@ class ProcessArrays(NamedTuple):
     start_cumulative: FloatArray  # [n], 1 at the last
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SampledProcess:
     """An MDP whose steps can be sampled."""
 

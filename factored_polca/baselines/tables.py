@@ -32,7 +32,7 @@ class TableArrays(NamedTuple):
     visits: IntArray  # [entry], how often each was updated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """Where the values of one function are stored."""
 

@@ -44,7 +44,7 @@ class GraphArrays(NamedTuple):
     depth: int  # tasks on the longest path from the root
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TaskGraph:
     """A task graph over numbered states."""
 
@@ -69,7 +69,7 @@ class TaskGraph:
         return self.pairs.index((task, slot))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TaskRow:
     """One task of a graph: its slots by name with their children [s], and where it is over [s]."""
 

@@ -32,7 +32,7 @@ from factored_polca.models import ModelError
 NEEDED = ("x", "y", "passenger", "destination")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TaxiFacts:
     """What task graphs and abstractions ask of a Taxi model's states."""
 

@@ -20,7 +20,15 @@ from fractions import Fraction
 from typing import Any, Final
 
 from factored_polca import library
-from factored_polca.baselines import Learned, Schedule, learn, sampled_process, taxi_facts, taxi_methods
+from factored_polca.baselines import (
+    Learned,
+    SampledProcess,
+    Schedule,
+    learn,
+    sampled_process,
+    taxi_facts,
+    taxi_methods,
+)
 from factored_polca.baselines.learning import CLOSE, optimal_values
 from factored_polca.hierarchy import Options, plan_mdp
 from factored_polca.hierarchy.counts import QValueCounts
@@ -144,18 +152,26 @@ def study_q_values(
     for name, why in (("anywhere", "shows both values"), ("discount", "chooses it for each method")):
         if name in settings:
             raise ModelError(f"the parameter {name} can't be set: Figure 4c {why}")
+    variants = [(title, {**settings, "anywhere": anywhere}) for title, anywhere in VARIANTS]
+    processes = []  # of both before the work on one: what is too large is refused at once
+    for title, chosen in variants:
+        progress(f"{title}: listing the states")
+        processes.append(sampled_process(library.load("taxi", {**chosen, "discount": Fraction(1)}).model))
     domains = tuple(
-        _study(title, {**settings, "anywhere": anywhere}, episodes, seed, progress)
-        for title, anywhere in VARIANTS
+        _study(title, process, chosen, episodes, seed, progress)
+        for (title, chosen), process in zip(variants, processes, strict=True)
     )
     return QValueStudy(tuple(settings.items()), seed, CLOSE, domains, time.perf_counter() - began)
 
 
 def _study(
-    title: str, settings: dict[str, object], episodes: int | None, seed: int, progress: Progress
+    title: str,
+    process: SampledProcess,
+    settings: dict[str, object],
+    episodes: int | None,
+    seed: int,
+    progress: Progress,
 ) -> TaxiStudy:
-    progress(f"{title}: listing the states")
-    process = sampled_process(library.load("taxi", {**settings, "discount": Fraction(1)}).model)
     optimal, live = optimal_values(process), int(process.live.sum())
     schedule = Schedule(episodes=episodes or EPISODES_PER_STATE * live)
     learned = []
