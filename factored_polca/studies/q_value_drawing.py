@@ -61,7 +61,9 @@ def draw_stored_values(study: TaxiStudy, ax: Axes) -> Axes:
     ax.tick_params(axis="y", length=0)
     ax.set_xlabel("stored values (of learners dark: visited)")
     note = " and ".join(f"{float(one.discount):g}" for one in study.polca)
-    ax.set_title(f"{study.title}: {study.live_states:,} live states; PolCA at γ = {note}", loc="left")
+    ax.set_title(
+        f"{study.title}: {study.live_states:,} non-terminal states; PolCA at γ = {note}", loc="left"
+    )
     return _tidy(ax, "x")
 
 
