@@ -83,6 +83,8 @@ class Manager:
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0
+        self._made = 0
+        self._counted = 0
         self._abort = False
         self._undisturbed = False
         self._fields: dict[int, int] = {}
@@ -227,11 +229,14 @@ class Manager:
         return self._collect_at
 
     def _plan_collection(self) -> None:
-        """Collect when the store has doubled, earlier where the memory limit is near."""
+        """Collect when the store has trebled, earlier where the memory limit is near.
+
+        Small stores are quick ones: what fits into the processor's caches.
+        """
         room = len(self.pool)
         if self.bytes + 4 * (2 * room) <= self.memory_limit:
             room *= 2
-        self._collect_at = min(max(1 << 22, 2 * self._live), (self._live + room) // 2)
+        self._collect_at = min(max(1 << 18, 3 * self._live), (self._live + room) // 2)
 
     def collect_garbage(self) -> None:
         """Drop every node that no diagram reaches; all handles stay valid, caches are emptied.
@@ -247,7 +252,9 @@ class Manager:
         self.slots[:] = 0
         self.ring_state[0] = 0
         stack = np.empty(2 * self.leaf_level + 4, np.int32)
+        made = self.nodes_made
         compact(self.pool, self.head, self.unique, self.arity, self.roots, stack)
+        self._made, self._counted = made, int(self.head[1])
         self._live = int(self.head[0])
         self._plan_collection()
 
@@ -306,6 +313,11 @@ class Manager:
     def node_count(self) -> int:
         """Nodes in the store, garbage included."""
         return int(self.head[1])
+
+    @property
+    def nodes_made(self) -> int:
+        """How many nodes were ever made."""
+        return self._made + int(self.head[1]) - self._counted
 
     def _note_peak(self) -> None:
         self.peak_nodes = max(self.peak_nodes, int(self.head[1]))

@@ -20,7 +20,7 @@ from factored_polca.diagrams.diagram import Diagram
 from factored_polca.diagrams.field import Field
 from factored_polca.diagrams.leaves import FLOAT, INDEX, FloatLeaves, LeafType, payloads
 from factored_polca.diagrams.manager import Manager, require
-from factored_polca.diagrams.nodes import STEPS, Int32Array, find_or_add
+from factored_polca.diagrams.nodes import STEPS, Int32Array, add_node
 from factored_polca.diagrams.operators import OPERATORS, Kind, OperatorRow
 from factored_polca.diagrams.walk import collect, rebuild
 from factored_polca.diagrams.weighted import run_weighted_sum
@@ -41,7 +41,7 @@ def node(manager: Manager, level: int, children: Sequence[Diagram]) -> Diagram:
     words = np.array([child.node for child in children], dtype=np.int32)
     made = -1
     while made < 0:
-        made = find_or_add(manager.pool, manager.head, manager.unique, manager.arity, level, words, 0)
+        made = add_node(manager.pool, manager.head, manager.unique, manager.arity, level, words)
         if made < 0:
             manager.grow()
     return manager.handle(made, children[0].leaf_type)

@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams.apply import cache_index, float_payload
 from factored_polca.diagrams.field import field_add, field_multiply
-from factored_polca.diagrams.jit import inline, int64, kernel
+from factored_polca.diagrams.jit import inline, int64, lean_kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
@@ -178,7 +178,7 @@ def settle(
     return find_or_add(pool, head, unique, arity, leaf_level, terms, free), kept, top, normalised
 
 
-@kernel
+@lean_kernel
 def run_weighted_sum(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
@@ -256,7 +256,42 @@ def run_weighted_sum(
     return DONE
 
 
-@kernel
+@lean_kernel
+def collect_possible(
+    pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, stack: Int32Array,
+    weights: Int32Array, first_weight: Int64Array, last_changed: int, zero: int,
+) -> int:  # fmt: skip
+    """As `walk.collect`, without nodes to which only impossible values lead, those whose weight is 0
+    everywhere, and with none at all, answer 0, if then every leaf is 0."""
+    count = 0
+    some = False
+    stack[0] = root
+    stack[1] = 0
+    sp = 1
+    while sp > 0:
+        node = int64(stack[2 * sp - 2])
+        k = stack[2 * sp - 1]
+        level = pool[node]
+        if level <= last_changed and k < arity[level]:
+            stack[2 * sp - 1] = k + 1
+            if weights[first_weight[level] + k] == zero:
+                continue
+            child = int64(pool[node + 2 + k])
+            number = int64(pool[child + 1])
+            if number < 0 or number >= count or nodes[number] != child:
+                stack[2 * sp] = child
+                stack[2 * sp + 1] = 0
+                sp += 1
+            continue
+        some = some or (level > last_changed and node != zero)
+        pool[node + 1] = count
+        nodes[count] = node
+        count += 1
+        sp -= 1
+    return count if some else 0
+
+
+@lean_kernel
 def run_regression(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
@@ -265,12 +300,14 @@ def run_regression(
     cache: Int32Array, key: int, nodes: Int32Array, count: int, weights: Int32Array,
     first_weight: Int64Array, last_changed: int, regressed: Int32Array, progress: Int64Array,
 ) -> int:  # fmt: skip
-    """Regress the `count` nodes in `nodes` (children first, numbered in their scratch words).
+    """Regress the `count` nodes in `nodes` (children first, numbered in their scratch words; those that
+    no possible value leads to may be missing, see `collect_possible`).
 
     `weights[first_weight[i] + v]` is the diagram of P(x_i' = v | x).  `progress` is
     [next node, 1 if a sum is under way]; `cache` remembers regressions under `key` between calls.
     """
     mask = (len(cache) >> 2) - 1
+    zero = np.int32(options[ZERO])
     while progress[0] < count:
         node = int64(nodes[progress[0]])
         level = pool[node]
@@ -286,8 +323,11 @@ def run_regression(
                 continue
             d = arity[level]
             for v in range(d):
-                terms[2 * v] = weights[first_weight[level] + v]
-                terms[2 * v + 1] = regressed[pool[pool[node + 2 + v] + 1]]
+                weight = weights[first_weight[level] + v]
+                terms[2 * v] = weight
+                terms[2 * v + 1] = zero
+                if weight != zero:
+                    terms[2 * v + 1] = regressed[pool[pool[node + 2 + v] + 1]]
             stack[0] = 0
             stack[1] = d
             stack[2] = -1

@@ -24,10 +24,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.diagrams.jit import int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, Int32Array, Int64Array
-from factored_polca.diagrams.walk import collect
-from factored_polca.diagrams.weighted import NORMALISED, ONE, ZERO, run_regression, run_weighted_sum
+from factored_polca.diagrams.weighted import (
+    NORMALISED,
+    ONE,
+    ZERO,
+    collect_possible,
+    run_regression,
+    run_weighted_sum,
+)
 from factored_polca.minimisation.split_kernel import (
     ALLOWED,
     BLOCKS,
@@ -49,7 +55,7 @@ CHOICE, STEP, PLACE = range(3)
 """Places in `progress`."""
 
 
-@kernel
+@lean_kernel
 def run_passes(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array, stack: Int32Array, terms: Int32Array,
@@ -94,7 +100,14 @@ def run_passes(
                             if walked[0] == 0 and walked[1] == 0:
                                 if len(changed) <= head[1]:
                                     return ROOM
-                                counts[0] = collect(pool, arity, value, changed, stack)
+                                counts[0] = collect_possible(
+                                    pool, arity, value, changed, stack, weights, first_weights[p],
+                                    last_changed[p], zero,
+                                )  # fmt: skip
+                                if counts[0] == 0:
+                                    regressed[p] = zero
+                                    progress[PLACE] += 1
+                                    continue
                             code = run_regression(
                                 pool, head, unique, arity, slots, ring, ring_state, sums, field,
                                 stack, terms, results, sum_state, cache, keys[p], changed,
