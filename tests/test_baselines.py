@@ -170,15 +170,15 @@ ALL = np.ones(4, dtype=np.int64)
 AT_2 = np.array([False, False, True, True])
 
 
-def corridor_graph(process: SampledProcess, *root: tuple[str, int], tail: bool = False) -> TaskGraph:
+def corridor_graph(process: SampledProcess, *root: tuple[str, int], tail: int = NONE) -> TaskGraph:
     """A root that calls `root`, and the task Approach, code 4 (5 with `tail`), which ends in cell 2.
 
-    With `tail` the root calls Serve, code 4: Approach, then Finish.
+    With `tail` there is Serve, code 4: Approach, then the tail.
     """
     terminal = process.arrays.terminal
     rows = [TaskRow("Root", tuple((name, code * ALL) for name, code in root), terminal)]
-    if tail:
-        rows.append(TaskRow("Serve", (("Approach", 5 * ALL),), np.zeros(4, dtype=np.bool_), FINISH))
+    if tail != NONE:
+        rows.append(TaskRow("Serve", (("Approach", 5 * ALL),), np.zeros(4, dtype=np.bool_), tail))
     rows.append(TaskRow("Approach", (("Left", LEFT * ALL), ("Right", RIGHT * ALL)), AT_2))
     return task_graph(rows, terminal, 3)
 
@@ -237,6 +237,19 @@ def expected_alisp(gamma: float) -> Expected:
     yield 1, "Serve", "Approach", 2, 10.0
 
 
+def expected_longer_alisp(gamma: float) -> Expected:
+    yield 0, "Root", "Finish", 2, 10.0
+    for cell in range(2):
+        steps = 2 - cell
+        yield 0, "Root", "Serve", cell, approach(gamma, cell) - gamma**steps
+        yield 1, "Root", "Serve", cell, gamma ** (steps + 1) * 10
+        yield 0, "Serve", "Approach", cell, approach(gamma, cell)
+        yield 1, "Serve", "Approach", cell, -(gamma**steps)
+        yield 2, "Serve", "Approach", cell, gamma ** (steps + 1) * 10
+        yield 1, "Approach", "Right", cell, gamma * approach(gamma, cell + 1)
+        yield 2, "Approach", "Right", cell, -(gamma**steps) + gamma ** (steps + 1) * 10
+
+
 def flat_method(process: SampledProcess) -> Method:
     return q_learning(process)
 
@@ -255,7 +268,15 @@ def maxq_method(process: SampledProcess) -> Method:
 
 
 def alisp_method(process: SampledProcess) -> Method:
-    graph = corridor_graph(process, ("Serve", 4), tail=True)
+    return alisp_on(process, corridor_graph(process, ("Serve", 4), tail=FINISH))
+
+
+def longer_alisp_method(process: SampledProcess) -> Method:
+    """Serve ends in a wasted step to the right in cell 2, and the root has to finish."""
+    return alisp_on(process, corridor_graph(process, ("Serve", 4), ("Finish", FINISH), tail=RIGHT))
+
+
+def alisp_on(process: SampledProcess, graph: TaskGraph) -> Method:
     return alisp(graph, *(full_table(part, len(graph.pairs), process.live) for part in ("r", "c", "e")))
 
 
@@ -265,6 +286,7 @@ CORRIDOR: dict[str, tuple[Callable[[SampledProcess], Method], Callable[[float], 
     "options": (options_method, expected_options),
     "maxq": (maxq_method, expected_maxq),
     "alisp": (alisp_method, expected_alisp),
+    "alisp, longer": (longer_alisp_method, expected_longer_alisp),
 }
 
 
@@ -280,9 +302,14 @@ def test_values_in_the_corridor_are_the_closed_forms(name: str, discount: Fracti
         assert found.values[table][entry] == pytest.approx(value, abs=1e-6), (table, task, slot, cell)
     optimum = (10 + (gamma * 10 - 1) + (gamma**2 * 10 - 1 - gamma)) / 3
     assert found.optimum == pytest.approx(optimum, abs=1e-9)
+    if name == "alisp, longer":  # the program costs a step in cells 0 and 1
+        optimum -= (gamma + gamma**2 + (1 - gamma) * 10 * (gamma + gamma**2)) / 3
     assert found.greedy_returns[-1] == pytest.approx(optimum, abs=1e-9)
-    assert found.training_returns[-1] == pytest.approx(optimum, abs=1e-9)
-    assert found.episodes_to() is not None
+    if name == "alisp, longer":
+        assert found.episodes_to() is None
+    else:  # what an optimal policy earns does not hang on the starts that were drawn
+        assert found.training_returns[-1] == pytest.approx(optimum, abs=1e-9)
+        assert found.episodes_to() is not None
     if name == "maxq":  # V of the primitive actions
         assert found.values[1][method.tables[1].index[FINISH, 2]] == pytest.approx(10)
         assert found.values[1][method.tables[1].index[FINISH, 0]] == pytest.approx(-5)

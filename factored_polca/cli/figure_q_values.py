@@ -13,9 +13,10 @@ from factored_polca.cli.source import parse_settings
 
 def figure_4c(arguments: argparse.Namespace, output: Output) -> int:
     """Count and learn, print both tables, and draw them where that is asked for."""
-    from factored_polca.studies.q_values import study_q_values
+    from factored_polca.studies.q_values import refuse_settings, study_q_values
 
     settings = parse_settings(arguments.set)
+    refuse_settings(settings)
     compile_kernels(output)
     with announced_compiling(output), output.progress("learning Taxi and Taxi2"):
         study = study_q_values(
@@ -42,15 +43,15 @@ def figure_4c(arguments: argparse.Namespace, output: Output) -> int:
 
 def print_4c(data: dict[str, Any], output: Output) -> None:
     """A table for each domain."""
-    close = f"episodes to {data['close']:.0%}"
+    close = f"within {data['close']:.0%}"
     for domain in data["domains"]:
         title = (
             f"{domain['domain']}: {domain['live_states']:,} states that are not terminal, "
             f"{domain['episodes']:,} episodes"
         )
         columns = {
-            "method": "left", "discount": "right", "stored values": "right", "visited": "right",
-            close: "right", "return": "right", "optimum": "right",
+            "method": "left", "γ": "right", "stored": "right", "visited": "right", close: "right",
+            "return": "right", "optimum": "right",
         }  # fmt: skip
         table = make_table(title, columns)
         for row in domain["learners"]:
@@ -70,12 +71,12 @@ def print_4c(data: dict[str, Any], output: Output) -> None:
         output.table(table)
         output.line()
     output.line(
-        "stored values: entries allocated over the states that are not terminal; visited: those that "
-        "learning updated"
+        "stored: values, allocated over the states that are not terminal; visited: those that learning "
+        "updated"
     )
     output.line(
-        f"{close}: from there on the greedy policy is within {data['close']:.0%} of the optimal return; "
-        "returns are exact, discounted, from the start"
+        f"{close}: of the optimal return the greedy policy is from that episode on; returns are exact, "
+        "discounted, from the start; endless: the greedy policy may never end"
     )
     output.line(
         "PolCA plans and counts Q-values: of blocks and actions, of pairs that an action's transitions and "
@@ -92,4 +93,4 @@ def polca_counts() -> tuple[tuple[str, str], ...]:
 
 def shown(value: float) -> str:
     """A return."""
-    return "may not end" if value == float("-inf") else f"{value:.4f}"
+    return "endless" if value == float("-inf") else f"{value:.4f}"

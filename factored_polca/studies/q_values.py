@@ -30,10 +30,11 @@ from factored_polca.baselines import (
     taxi_methods,
 )
 from factored_polca.baselines.learning import CLOSE, optimal_values
+from factored_polca.baselines.process import MAXIMUM_STATES
 from factored_polca.hierarchy import Options, plan_mdp
 from factored_polca.hierarchy.counts import QValueCounts
 from factored_polca.hierarchy.plan import total_counts
-from factored_polca.models import ModelError
+from factored_polca.models import LimitReached, ModelError
 from factored_polca.studies.parameters import Progress, silent
 
 DISCOUNTS: Final = (Fraction(1), Fraction(95, 100))
@@ -149,19 +150,34 @@ def study_q_values(
     """
     began = time.perf_counter()
     settings = dict(settings or {})
-    for name, why in (("anywhere", "shows both values"), ("discount", "chooses it for each method")):
-        if name in settings:
-            raise ModelError(f"the parameter {name} can't be set: Figure 4c {why}")
+    refuse_settings(settings)
     variants = [(title, {**settings, "anywhere": anywhere}) for title, anywhere in VARIANTS]
     processes = []  # of both before the work on one: what is too large is refused at once
     for title, chosen in variants:
         progress(f"{title}: listing the states")
-        processes.append(sampled_process(library.load("taxi", {**chosen, "discount": Fraction(1)}).model))
+        model = library.load("taxi", {**chosen, "discount": Fraction(1)}).model
+        if model.states > MAXIMUM_STATES:
+            raise LimitReached(
+                f"{title} has {model.states:,} states; learners' tables are made for at most "
+                f"{MAXIMUM_STATES:,}: give a smaller size"
+            )
+        processes.append(sampled_process(model))
     domains = tuple(
         _study(title, process, chosen, episodes, seed, progress)
         for (title, chosen), process in zip(variants, processes, strict=True)
     )
     return QValueStudy(tuple(settings.items()), seed, CLOSE, domains, time.perf_counter() - began)
+
+
+def refuse_settings(settings: Mapping[str, object]) -> None:
+    """Refuse the parameters that the figure chooses itself.
+
+    Raises:
+        ModelError: one of them is set.
+    """
+    for name, why in (("anywhere", "shows both values"), ("discount", "chooses it for each method")):
+        if name in settings:
+            raise ModelError(f"the parameter {name} can't be set: Figure 4c {why}")
 
 
 def _study(
