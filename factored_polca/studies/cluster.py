@@ -38,6 +38,8 @@ from factored_polca.models import Fault, ModelError
 
 PROVIDERS: Final = ("local", "slurm", "kubernetes")
 MOST: Final = 10_000
+HEARTBEAT_SECONDS: Final = 5
+"""Workers that hear nothing for six heartbeats end."""
 ONLY: Final = {
     "walltime": "slurm", "partition": "slurm", "account": "slurm", "options": "slurm",
     "image": "kubernetes", "namespace": "kubernetes",
@@ -127,7 +129,10 @@ def make_config(cluster: Cluster, folder: str) -> Any:
         MissingLibrary: Parsl is not installed.
     """
     local = cluster.provider == "local"
-    options: dict[str, Any] = {"encrypted": not local, "cores_per_worker": 1e-6 if local else 1.0}
+    options: dict[str, Any] = {
+        "heartbeat_period": HEARTBEAT_SECONDS, "heartbeat_threshold": 6 * HEARTBEAT_SECONDS,
+        "encrypted": not local, "cores_per_worker": 1e-6 if local else 1.0,
+    }  # fmt: skip
     if local:
         options |= {"address": "127.0.0.1", "loopback_address": "127.0.0.1"}
     if cluster.address is not None:
@@ -170,9 +175,10 @@ def open_cluster(cluster: Cluster) -> Iterator[Executor]:
     Raises:
         MissingLibrary: Parsl is not installed.
     """
-    with own_programs_found(), tempfile.TemporaryDirectory(
-        prefix="study-parsl-", ignore_cleanup_errors=True
-    ) as folder:
+    with (
+        own_programs_found(),
+        tempfile.TemporaryDirectory(prefix="study-parsl-", ignore_cleanup_errors=True) as folder,
+    ):
         config = make_config(cluster, folder)
         with parsl_module("concurrent").ParslPoolExecutor(config) as pool:
             executor: Executor = pool
@@ -181,7 +187,7 @@ def open_cluster(cluster: Cluster) -> Iterator[Executor]:
 
 @contextmanager
 def own_programs_found() -> Iterator[None]:
-    """Parsl starts programs of its own by name: those beside this Python, whose folder may not be on PATH."""
+    """Parsl starts programs of its own by name: they lie beside this Python, perhaps not on PATH."""
     before = os.environ.get("PATH", os.defpath)
     os.environ["PATH"] = os.pathsep.join([os.path.dirname(sys.executable), before])
     try:

@@ -89,6 +89,26 @@ def session_of(process: int) -> int | None:
         return None
 
 
+def process_space() -> str | None:
+    """What process numbers mean here: the boot of the machine and the name space (Linux), else None."""
+    try:
+        with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
+            return f"{file.read().strip()} {os.stat('/proc/self/ns/pid').st_ino}"
+    except OSError:
+        return None
+
+
+def is_alive(process: int) -> bool:
+    """Whether there is a process of that number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
 def kill_tree(root: int, *, itself: bool = True) -> None:
     """Kill all below `root`, and `root` first if `itself`; whoever started `root` must wait for it."""
     if itself:

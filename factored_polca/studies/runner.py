@@ -11,7 +11,6 @@ up to `ATTEMPTS` times, then recorded as errors.
 from __future__ import annotations
 
 import re
-import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ from factored_polca.studies.limits import Limits
 from factored_polca.studies.model_text import ModelText
 from factored_polca.studies.provenance import now
 from factored_polca.studies.store import Store
-from factored_polca.studies.warden_client import Outcome, Warden, WorkerLost, run_here
+from factored_polca.studies.warden_client import Outcome, Warden, WorkerLost, run_here, this_client
 
 ATTEMPTS: Final = 3
 POLL_SECONDS: Final = 0.5
@@ -147,10 +146,10 @@ def local_start(groups: Sequence[Mapping[str, Any]]) -> Iterator[Start]:
 
 def executor_start(executor: Executor, groups: Sequence[Mapping[str, Any]]) -> Start:
     """Runs wherever an executor does its work; modules are looked for in the same folders as here."""
-    path = list(sys.path)
+    client = this_client()
 
     def start(request: Mapping[str, Any]) -> Future[Outcome]:
-        return executor.submit(run_here, request, groups, path)
+        return executor.submit(run_here, request, groups, client)
 
     return start
 

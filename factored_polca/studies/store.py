@@ -193,6 +193,12 @@ class Store:
             FROM runs WHERE place IS NOT NULL GROUP BY 1, 2 ORDER BY min(place)"""
         return {(work, model): count for work, model, count in self._connection.execute(query)}
 
+    def statuses(self) -> list[tuple[dict[str, Any], str | None]]:
+        """The parameters of each run of the grid, with the status of its result if there is one."""
+        query = """SELECT runs.parameters, results.status FROM runs LEFT JOIN results USING (key)
+            WHERE place IS NOT NULL ORDER BY place"""
+        return [(json.loads(text), status) for text, status in self._connection.execute(query)]
+
     def finished(self, limits: Limits, retry: Collection[str] = ()) -> set[str]:
         """The keys of runs that need not be run again.
 

@@ -2,7 +2,7 @@
 
 It is asked through its standard input and answers through its standard output, a JSON line each:
 
-    {"groups": [...]}                       first: kinds of runs, whose kernels are made ready
+    {"groups": [...], ...}                  first: kinds of runs, whose kernels are made ready
     {"start": 7, "request": {...}}          start a run; many may be going on
     {"ready": {...}}                        the kernels are; what was loaded, in how long, on what machine
     {"done": 7, "outcome": {...}}           a run has ended, or was ended
@@ -17,7 +17,8 @@ its time or memory is killed with all that it has started, and recorded as `time
 *No orphans.*  Three things may die without a word.  A run's children: they become this process's children
 (subreaper), count as the run's as long as they are in its session, and are killed otherwise.  This
 process: the kernel then kills the runs (parent death signal).  Who asks: standard input ends, or the
-parent is another one than before; then all runs are killed, and it ends.
+parent is another one than before, or the process that writes the store, where that is another one on this
+machine, is gone; then all runs are killed, and it ends.
 """
 
 from __future__ import annotations
@@ -33,14 +34,16 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from factored_polca.studies.limits import (
     Limits,
     descendants,
+    is_alive,
     kill_tree,
+    process_space,
     resident_bytes,
     session_of,
     tree_bytes,
@@ -92,6 +95,7 @@ class Warden:
         self.forks = False
         self.asked = b""
         self.listening = True
+        self.client: int | None = None  # another process for whom all this is done, on this machine
 
     # -- the loop --
 
@@ -116,6 +120,7 @@ class Warden:
             if time.monotonic() - swept > 1:
                 swept = time.monotonic()
                 self.sweep()
+                self.listening = self.listening and (self.client is None or is_alive(self.client))
         self.end()
 
     def listen_for_deaths(self) -> None:
@@ -162,6 +167,8 @@ class Warden:
         for line in lines:
             message = json.loads(line)
             if "groups" in message:
+                if message["space"] is not None and message["space"] == process_space():
+                    self.client = message["client"]
                 self.prepare(message["groups"])
             else:
                 self.start(message["start"], message["request"])
@@ -173,7 +180,8 @@ class Warden:
         self.groups = groups
         seconds: dict[str, float] = {}
         if any(":" not in group["work"] for group in groups):
-            seconds = worker.warm_kernels(groups)
+            with self.ending_with_asker():
+                seconds = worker.warm_kernels(groups)
         threads = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
         self.forks = threads == 1
         gc.collect()
@@ -185,6 +193,23 @@ class Warden:
                 "base_memory_bytes": resident_bytes(os.getpid()),
             }
         })  # fmt: skip
+
+    @contextlib.contextmanager
+    def ending_with_asker(self) -> Iterator[None]:
+        """End at once where the asker does, while this process is busy and doesn't listen."""
+
+        def look(*_: object) -> None:
+            if os.getppid() != self.asker:
+                self.end()
+                os._exit(1)
+
+        before = signal.signal(signal.SIGALRM, look)
+        signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
 
     def start(self, number: int, request: dict[str, Any]) -> None:
         """Start a run."""

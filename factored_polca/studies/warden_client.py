@@ -20,6 +20,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, TypeAlias
 
+from factored_polca.studies.limits import process_space
+
+Client: TypeAlias = Mapping[str, Any]
+"""The process that writes the store: its number, what numbers mean there, where its modules are."""
+
 Outcome: TypeAlias = dict[str, Any]
 """What came of a run, as plain data: see `factored_polca.studies.store`."""
 
@@ -42,13 +47,15 @@ class WorkerLost(RuntimeError):
 class Warden:
     """The near end of a process that starts, supervises and ends runs on this machine."""
 
-    def __init__(self, groups: Sequence[Mapping[str, Any]], path: Sequence[str] = ()) -> None:
+    def __init__(self, groups: Sequence[Mapping[str, Any]], client: Client | None = None) -> None:
         """Start it; `groups` are the kinds of runs to come, whose kernels it loads or compiles.
 
-        `path` are more folders where modules are looked for, last.  Returns at once: `about` waits until it is ready.
+        `client` is for whom this is done, if it is another process.  Returns at once: `about` waits
+        until it is ready.
         """
         self.owner = os.getpid()
-        folders = list(dict.fromkeys((*sys.path, *path)))
+        client = client or this_client()
+        folders = list(dict.fromkeys((*sys.path, *client["path"])))
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", _START, json.dumps(folders)],
@@ -61,7 +68,7 @@ class Warden:
         self._ready: Future[dict[str, Any]] = Future()
         self._lost = ""
         _WARDENS.append(self)
-        self._send({"groups": list(groups)})
+        self._send({"groups": list(groups), "client": client["process"], "space": client["space"]})
         threading.Thread(target=self._listen, daemon=True, name="warden").start()
 
     def about(self) -> dict[str, Any]:
@@ -166,12 +173,15 @@ _HERE: Final[dict[int, Warden]] = {}
 _MAKING: Final = threading.Lock()
 
 
-def run_here(
-    request: Mapping[str, Any], groups: Sequence[Mapping[str, Any]], path: Sequence[str]
-) -> Outcome:
+def this_client() -> Client:
+    """This process, as what is done for it elsewhere needs to know it."""
+    return {"process": os.getpid(), "space": process_space(), "path": list(sys.path)}
+
+
+def run_here(request: Mapping[str, Any], groups: Sequence[Mapping[str, Any]], client: Client) -> Outcome:
     """Do a run on the machine where this is called, under a warden of this process; wait for it.
 
-    `groups` and `path` are those of `Warden`, which is started by the first call.
+    `groups` and `client` are those of `Warden`, which is started by the first call.
 
     Raises:
         WorkerLost: the warden has ended.
@@ -179,7 +189,7 @@ def run_here(
     with _MAKING:
         warden = _HERE.get(os.getpid())
         if warden is None or not warden.alive:
-            warden = _HERE[os.getpid()] = Warden(groups, path)
+            warden = _HERE[os.getpid()] = Warden(groups, client)
         warden.about()
         future = warden.start(request)
     return future.result()
