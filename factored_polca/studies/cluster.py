@@ -180,9 +180,13 @@ def open_cluster(cluster: Cluster) -> Iterator[Executor]:
         tempfile.TemporaryDirectory(prefix="study-parsl-", ignore_cleanup_errors=True) as folder,
     ):
         config = make_config(cluster, folder)
-        with parsl_module("concurrent").ParslPoolExecutor(config) as pool:
-            executor: Executor = pool
+        executor: Executor = parsl_module("concurrent").ParslPoolExecutor(config)
+        done = False
+        try:
             yield executor
+            done = True
+        finally:
+            executor.shutdown(wait=done)  # workers that are stopped kill their runs
 
 
 @contextmanager

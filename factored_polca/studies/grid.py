@@ -205,10 +205,12 @@ def make_grid(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Grid:
     """
     reader = _Reader(path)
     work = reader.work(table.get("work"))
+    if not work:
+        raise ModelError(reader.faults)  # what else is right depends on it
     custom = ":" in work
-    known = {"work", "model", "set", "seed", *(() if custom or not work else OPTIONS[work])}
+    known = {"work", "model", "set", "seed", *(() if custom else OPTIONS[work])}
     for key in table:
-        if key not in known and work:
+        if key not in known:
             reader.unknown(key, known, f"of {work}" if not custom else "of a function's grid")
     models = reader.axis("model", table.get("model"), _model)
     if not custom and not models and "model" not in table:
@@ -216,7 +218,7 @@ def make_grid(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Grid:
     settings = reader.settings(table.get("set", {}), custom)
     options = tuple(
         (name, reader.axis(name, table[name], read))
-        for name, read in ({} if custom or not work else OPTIONS[work]).items()
+        for name, read in ({} if custom else OPTIONS[work]).items()
         if name in table
     )
     seeds = reader.axis("seed", table.get("seed", 0), seed, ranges=True)
@@ -335,7 +337,8 @@ class _Reader:
                 continue
             known = {parameter.name for parameter in library.describe(model).parameters}
             for name, _ in grid.settings:
-                if name not in known and grid.work in WORKS:
+                told = any(fault.path == (*self.path, "set", name) for fault in self.faults)
+                if name not in known and grid.work in WORKS and not told:
                     self.unknown(name, known, f"of {model}", ("set",))
 
 

@@ -39,6 +39,8 @@ MOST_PARAMETERS: Final = 4
 WIDTH: Final = 9.0
 """Inches."""
 DOTS_PER_INCH: Final = 140
+LEGEND_DISTANCE: Final = 0.5
+"""Inches from the axes to a legend below them: the room of the ticks' numbers and the axis' name."""
 MARKERS: Final = "osD^vP*Xd<"
 
 
@@ -240,8 +242,8 @@ def draw_cactus(comparison: Comparison, names: Sequence[str], ax: Axes, theme: T
     if len(limits) == 1 and (limit := limits.pop()) < 20 * ax.get_ylim()[1]:
         ax.axhline(limit, color=theme.ink, linewidth=0.8, linestyle=":")
         ax.annotate(
-            f"limit {limit:g} s", (1, limit), xycoords=("axes fraction", "data"), xytext=(-2, -3),
-            textcoords="offset points", ha="right", va="top", fontsize=8,
+            f"limit {limit:g} s", (0, limit), xycoords=("axes fraction", "data"), xytext=(4, -3),
+            textcoords="offset points", ha="left", va="top", fontsize=8,
         )  # fmt: skip
     ax.set_xlim(0, max(most * 1.02, 1.5))
     whole_numbers(ax)
@@ -363,7 +365,7 @@ def draw_growth(series: Sequence[Series], quantity: str, ax: Axes, theme: Theme)
         xs, ys = zip(*growth.points, strict=True)
         ax.plot(
             xs, ys, color=colour, linestyle="none", marker=MARKERS[number], markersize=4.5, alpha=0.9,
-            label=f"{shown(name_of(one, series), 36)}:  {growth.better.text('n')}",
+            label=f"{shown(name_of(one, series), 28)}:  {growth.better.text('n')}",
         )  # fmt: skip
         steps = [xs[0] * (xs[-1] / xs[0]) ** (k / 60) for k in range(61)]
         ax.plot(steps, [growth.better.at(x) for x in steps], color=colour, linewidth=1.1, alpha=0.8)
@@ -449,11 +451,14 @@ def legend_inches(count: int, columns: int) -> float:
 
 def legend_below(ax: Axes, count: int, columns: int) -> Axes:
     """A legend below the axes; how many lines were left out stands in its title."""
+    from matplotlib.transforms import ScaledTranslation
+
     handles: Iterable[Any] = ax.get_legend_handles_labels()[0]
     if handles:
+        below = ScaledTranslation(0, -LEGEND_DISTANCE, ax.figure.dpi_scale_trans)
         ax.legend(
-            loc="upper left", bbox_to_anchor=(-0.02, -0.16), ncols=columns, title=left_out(count),
-            title_fontsize=8, alignment="left", borderaxespad=0,
+            loc="upper left", bbox_to_anchor=(-0.02, 0), bbox_transform=ax.transAxes + below, ncols=columns,
+            title=left_out(count), title_fontsize=8, alignment="left", borderaxespad=0,
         )  # fmt: skip
     return ax
 

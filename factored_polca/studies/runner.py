@@ -84,25 +84,29 @@ def run_all(
     work = _Work(deque(run for run in runs if run.key not in done))
     began, before, written = time.monotonic(), len(runs) - len(work.pending), 0
     sent = {"seconds": limits.seconds, "memory_bytes": limits.memory_bytes}
-    while work.pending or work.going_on:
-        while work.pending and len(work.going_on) < slots:
-            run = work.pending.popleft()
-            text = files[run.model].text if run.model in files else None
-            work.going_on[start(run.request(text, sent))] = run
-        if progress is not None:
-            progress(
-                Progress(
-                    before + written, len(runs), tuple(work.going_on.values()), store.counts().by_status,
-                    time.monotonic() - began, written,
-                )
-            )  # fmt: skip
-        finished, _ = wait(work.going_on, POLL_SECONDS, FIRST_COMPLETED)
-        for future in finished:
-            run = work.going_on.pop(future)
-            outcome = outcome_of(future, run, work)
-            if outcome is not None:
-                store.record(launch, run, limits, outcome)
-                written += 1
+    try:
+        while work.pending or work.going_on:
+            while work.pending and len(work.going_on) < slots:
+                run = work.pending.popleft()
+                text = files[run.model].text if run.model in files else None
+                work.going_on[start(run.request(text, sent))] = run
+            if progress is not None:
+                progress(
+                    Progress(
+                        before + written, len(runs), tuple(work.going_on.values()),
+                        store.counts().by_status, time.monotonic() - began, written,
+                    )
+                )  # fmt: skip
+            finished, _ = wait(work.going_on, POLL_SECONDS, FIRST_COMPLETED)
+            for future in finished:
+                run = work.going_on.pop(future)
+                outcome = outcome_of(future, run, work)
+                if outcome is not None:
+                    store.record(launch, run, limits, outcome)
+                    written += 1
+    finally:
+        for future in work.going_on:
+            future.cancel()  # those that have not begun
     return written
 
 
@@ -149,7 +153,10 @@ def executor_start(executor: Executor, groups: Sequence[Mapping[str, Any]]) -> S
     client = this_client()
 
     def start(request: Mapping[str, Any]) -> Future[Outcome]:
-        return executor.submit(run_here, request, groups, client)
+        try:
+            return executor.submit(run_here, request, groups, client)
+        except BrokenExecutor as error:
+            raise WorkerLost(f"the executor has broken down: {error}") from error
 
     return start
 

@@ -97,6 +97,12 @@ class Warden:
         """Whether runs may be started."""
         return not self._lost
 
+    @property
+    def idle(self) -> bool:
+        """Whether no run is going on."""
+        with self._lock:
+            return not self._futures
+
     def close(self) -> None:
         """End all runs and the process; returns when it has ended."""
         if self.owner != os.getpid():
@@ -169,7 +175,7 @@ class Warden:
 
 
 _WARDENS: Final[list[Warden]] = []
-_HERE: Final[dict[int, Warden]] = {}
+_HERE: Final[dict[str, Warden]] = {}
 _MAKING: Final = threading.Lock()
 
 
@@ -181,15 +187,18 @@ def this_client() -> Client:
 def run_here(request: Mapping[str, Any], groups: Sequence[Mapping[str, Any]], client: Client) -> Outcome:
     """Do a run on the machine where this is called, under a warden of this process; wait for it.
 
-    `groups` and `client` are those of `Warden`, which is started by the first call.
+    `groups` and `client` are those of `Warden`, which is started by the first call with them.
 
     Raises:
         WorkerLost: the warden has ended.
     """
+    kind = json.dumps([list(groups), dict(client)])
     with _MAKING:
-        warden = _HERE.get(os.getpid())
+        for other in [key for key, one in _HERE.items() if key != kind and one.idle]:
+            _HERE.pop(other).close()  # of a study that was run before
+        warden = _HERE.get(kind)
         if warden is None or not warden.alive:
-            warden = _HERE[os.getpid()] = Warden(groups, client)
+            warden = _HERE[kind] = Warden(groups, client)
         warden.about()
         future = warden.start(request)
     return future.result()
