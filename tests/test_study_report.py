@@ -16,7 +16,8 @@ from factored_polca.studies import Store, make_grid
 from factored_polca.studies.fits import growth
 from factored_polca.studies.limits import Limits
 from factored_polca.studies.provenance import now, provenance
-from factored_polca.studies.report_plots import DARK, LIGHT, file_name, plain_number, plots, render, spaced
+from factored_polca.studies.report_axes import DARK, LIGHT, plain_number, spaced
+from factored_polca.studies.report_plots import file_name, plots, render
 from factored_polca.studies.report_series import brief, compare
 
 PNG = b"\x89PNG\r\n\x1a\n"

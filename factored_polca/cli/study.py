@@ -170,6 +170,9 @@ def tell(
     output.table(table)
     for text, count in messages(rows).items():
         output.line(f"{count:,} x {escape(text)}")
+    made_by = {f"{row['version.factored_polca']} {(row['commit'] or '')[:10]}".strip() for row in rows}
+    if len(made_by) > 1:
+        output.line(f"results are of several versions: {escape(', '.join(sorted(made_by)))}")
     if counts.beyond:
         output.line(f"{counts.beyond:,} further results are of runs that are no longer in the study")
     if going_on is not None:

@@ -17,8 +17,9 @@ from typing import Any, Final
 from factored_polca.formats.files import write_bytes, write_text
 from factored_polca.models import Fault, ModelError
 from factored_polca.studies.drawing import require_matplotlib
-from factored_polca.studies.report_plots import DARK, LIGHT, Plot, growth_texts, plots, render
-from factored_polca.studies.report_series import Comparison, brief, compare, seconds_of
+from factored_polca.studies.report_axes import DARK, LIGHT
+from factored_polca.studies.report_plots import Plot, growth_texts, plots, render
+from factored_polca.studies.report_series import Comparison, Row, brief, compare, seconds_of
 from factored_polca.studies.store import STATUSES, Store
 
 MOST_ROWS: Final = 500
@@ -40,6 +41,7 @@ th { border-bottom: 1px solid light-dark(#999, #777); font-weight: 600; }
 tr + tr td { border-top: 1px solid light-dark(#e8e8e8, #2b2e34); }
 td.text, th.text { text-align: left; white-space: normal; overflow-wrap: anywhere; min-width: 3.5rem; }
 img { max-width: 100%; height: auto; }
+pre { overflow-x: auto; font-size: 12px; line-height: 1.35; }
 .ok { color: light-dark(#00734f, #2bbf93); } .timeout { color: light-dark(#8a5f00, #f0b429); }
 .memout { color: light-dark(#a13f78, #dd8fbb); } .error { color: light-dark(#b34700, #f07a3a); }
 """
@@ -182,19 +184,20 @@ def growth_section(comparison: Comparison) -> str:
 
 
 def messages_section(comparison: Comparison) -> str:
-    """What runs that did not end well said, most frequent first."""
-    found: dict[tuple[str, str, str], int] = {}
+    """What runs that did not end well said, most frequent first, with what one of each printed."""
+    found: dict[tuple[str, str, str], list[Row]] = {}
     for row in comparison.rows:
         if row["status"] != "ok":
-            said = (row["status"], row["stage"], row["message"][:300])
-            found[said] = found.get(said, 0) + 1
+            found.setdefault((row["status"], row["stage"], row["message"][:300]), []).append(row)
     if not found:
         return ""
-    ordered = sorted(found.items(), key=lambda item: -item[1])[:MOST_MESSAGES]
-    rows = [
-        [status, f"{count:,}", brief(stage, 60), message] for (status, stage, message), count in ordered
-    ]
-    body = table(["status", "runs", "stage reached", "message"], rows)
+    ordered = sorted(found.items(), key=lambda item: -len(item[1]))[:MOST_MESSAGES]
+    cells = [[status, f"{len(rows):,}", brief(stage, 60), said] for (status, stage, said), rows in ordered]
+    body = table(["status", "runs", "stage reached", "message"], cells)
+    for (status, _, _), rows in ordered:
+        if rows[0]["detail"]:
+            name = f"{status}: {brief(rows[0]['instance'], 100)}"
+            body += f"<details><summary>{escape(name)}</summary><pre>{escape(rows[0]['detail'])}</pre></details>"
     return f"<h2>What went wrong</h2>{body}"
 
 

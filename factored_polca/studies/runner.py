@@ -81,6 +81,7 @@ def run_all(
         WorkerLost: no more runs can be started.
     """
     done = store.finished(limits, retry)
+    ended = Counter(status for key, status in store.by_key().items() if key in done)
     work = _Work(deque(run for run in runs if run.key not in done))
     began, before, written = time.monotonic(), len(runs) - len(work.pending), 0
     sent = {"seconds": limits.seconds, "memory_bytes": limits.memory_bytes}
@@ -94,7 +95,7 @@ def run_all(
                 progress(
                     Progress(
                         before + written, len(runs), tuple(work.going_on.values()),
-                        store.counts().by_status, time.monotonic() - began, written,
+                        dict(ended), time.monotonic() - began, written,
                     )
                 )  # fmt: skip
             finished, _ = wait(work.going_on, POLL_SECONDS, FIRST_COMPLETED)
@@ -103,6 +104,7 @@ def run_all(
                 outcome = outcome_of(future, run, work)
                 if outcome is not None:
                     store.record(launch, run, limits, outcome)
+                    ended[outcome["status"]] += 1
                     written += 1
     finally:
         for future in work.going_on:

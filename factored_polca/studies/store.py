@@ -50,8 +50,8 @@ CREATE TABLE results (
 """
 
 RESULT_COLUMNS: Final = (
-    "status", "message", "stage", "wall_seconds", "cpu_seconds", "peak_memory_bytes", "base_memory_bytes",
-    "time_limit_seconds", "memory_limit_bytes", "started", "finished",
+    "status", "message", "detail", "stage", "wall_seconds", "cpu_seconds", "peak_memory_bytes",
+    "base_memory_bytes", "time_limit_seconds", "memory_limit_bytes", "started", "finished",
 )  # fmt: skip
 
 
@@ -198,6 +198,11 @@ class Store:
         query = """SELECT runs.parameters, results.status FROM runs LEFT JOIN results USING (key)
             WHERE place IS NOT NULL ORDER BY place"""
         return [(json.loads(text), status) for text, status in self._connection.execute(query)]
+
+    def by_key(self) -> dict[str, str]:
+        """The status of each run of the grid that has a result."""
+        query = "SELECT key, status FROM results JOIN runs USING (key) WHERE place IS NOT NULL"
+        return {str(key): str(status) for key, status in self._connection.execute(query)}
 
     def finished(self, limits: Limits, retry: Collection[str] = ()) -> set[str]:
         """The keys of runs that need not be run again.

@@ -6,6 +6,7 @@ It is asked through its standard input and answers through its standard output, 
     {"start": 7, "request": {...}}          start a run; many may be going on
     {"ready": {...}}                        the kernels are; what was loaded, in how long, on what machine
     {"done": 7, "outcome": {...}}           a run has ended, or was ended
+    {"done": 7, "failed": "..."}            there is no process for it
 
 Starting Python and loading the libraries and kernels takes a second or two; forking a process that has
 done so takes some milliseconds.  So this one loads them, runs nothing itself, has one thread only (else
@@ -220,9 +221,16 @@ class Warden:
             os.set_blocking(end, False)
         started, began = now(), time.monotonic()
         make = self.forked if self.forks else self.fresh
-        process = make(request, writing, errors_of_run)
-        os.close(writing)
-        os.close(errors_of_run)
+        try:
+            process = make(request, writing, errors_of_run)
+        except OSError as error:  # no memory for it, or too many processes
+            os.close(reading)
+            os.close(errors)
+            self.answer({"done": number, "failed": f"no process could be started: {error}"})
+            return
+        finally:
+            os.close(writing)
+            os.close(errors_of_run)
         going = Going(
             number, process, reading, errors, Limits(given["seconds"], given["memory_bytes"]), started,
             began, has_begun=self.forks,
@@ -242,6 +250,7 @@ class Warden:
         try:
             os.dup2(errors, 2)
             worker.live(request, worker.enter(warden, pipe))
+            sys.stdout.flush()
             os._exit(0)
         except BaseException:
             traceback.print_exc()

@@ -34,6 +34,9 @@ THREADS: Final = (
 )  # fmt: skip
 """Runs compute on one thread each, so that their times can be compared, and that forking is safe."""
 
+CLOSING_SECONDS: Final = 30.0
+"""Seconds that a warden may take to kill all its runs."""
+
 _START: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from factored_polca.studies.warden import main; main()"
@@ -111,7 +114,11 @@ class Warden:
             _WARDENS.remove(self)
         with self._lock, contextlib.suppress(OSError):
             self._stdin.close()
-        self._process.wait()
+        try:
+            self._process.wait(CLOSING_SECONDS if self._ready.done() else 0.5)
+        except subprocess.TimeoutExpired:  # it is busy, with compiling kernels as a rule
+            self._process.kill()
+            self._process.wait()
         self._errors.close()
 
     def let_go(self) -> None:
@@ -150,6 +157,9 @@ class Warden:
                     continue
                 with self._lock:
                     future = self._futures.pop(message["done"])
+                if "failed" in message:
+                    future.set_exception(WorkerLost(message["failed"]))
+                    continue
                 future.set_result(message["outcome"] | {"supervisor": about})
         self._fail()
 
