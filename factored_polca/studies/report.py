@@ -197,7 +197,8 @@ def messages_section(comparison: Comparison) -> str:
     for (status, _, _), rows in ordered:
         if rows[0]["detail"]:
             name = f"{status}: {brief(rows[0]['instance'], 100)}"
-            body += f"<details><summary>{escape(name)}</summary><pre>{escape(rows[0]['detail'])}</pre></details>"
+            printed = f"<pre>{escape(rows[0]['detail'])}</pre>"
+            body += f"<details><summary>{escape(name)}</summary>{printed}</details>"
     return f"<h2>What went wrong</h2>{body}"
 
 
