@@ -157,8 +157,11 @@ def tell(
         f"{store.name}: {counts.planned - counts.left:,} of {counts.planned:,} runs ended", columns
     )
     planned = store.planned()
+    by_name: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        by_name.setdefault((row["work"], row["model"]), []).append(row)
     for (work, model), total in planned.items():
-        mine = [row for row in rows if (row["work"], row["model"]) == (work, model)]
+        mine = by_name.get((work, model), [])
         often = [sum(row["status"] == name for row in mine) for name in STYLES]
         times = [row["wall_seconds"] for row in mine if row["status"] == "ok"]
         span = "" if not times else f"{min(times):.2g} .. {max(times):.2g}"

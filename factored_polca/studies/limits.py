@@ -19,9 +19,7 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,6 +27,9 @@ LOOKS: Final = 200
 """How often a tree is looked at while it is being killed."""
 
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+
+BY_CHILDREN: Final = os.path.exists(f"/proc/self/task/{os.getpid()}/children")
+"""Whether /proc tells the children of processes: Linux, as it is configured as a rule."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,31 +40,35 @@ class Limits:
     memory_bytes: int | None = None
 
 
+def children(process: int) -> list[int]:
+    """The children of one process; none where it is gone."""
+    if not BY_CHILDREN:
+        return [number for number, parent, _ in _table() if parent == process]
+    try:
+        threads = os.listdir(f"/proc/{process}/task")
+    except OSError:
+        return []
+    found: list[int] = []
+    for thread in threads:
+        with contextlib.suppress(OSError), open(f"/proc/{process}/task/{thread}/children", "rb") as file:
+            found += map(int, file.read().split())
+    return found
+
+
 def descendants(root: int) -> list[int]:
     """The processes below `root`, parents before children, dead ones that nobody waited for included."""
-    if sys.platform != "linux":
-        return _descendants_by_ps(root)
+    if not BY_CHILDREN:
+        return _below(root, _table())
     found, at = [root], 0
     while at < len(found):
-        found.extend(_children(found[at]))
+        found += children(found[at])
         at += 1
     return found[1:]
 
 
-def _children(process: int) -> Iterator[int]:
-    """The children of one process; none where it is gone."""
-    try:
-        threads = os.listdir(f"/proc/{process}/task")
-    except OSError:
-        return
-    for thread in threads:
-        with contextlib.suppress(OSError), open(f"/proc/{process}/task/{thread}/children", "rb") as file:
-            yield from map(int, file.read().split())
-
-
 def resident_bytes(process: int) -> int:
     """The resident set of one process now; 0 where it is gone."""
-    if sys.platform != "linux":
+    if not BY_CHILDREN:
         return sum(rss for number, _, rss in _table() if number == process)
     try:
         with open(f"/proc/{process}/statm", "rb") as file:
@@ -74,7 +79,7 @@ def resident_bytes(process: int) -> int:
 
 def tree_bytes(root: int) -> int:
     """The resident memory of `root` and of all below it."""
-    if sys.platform != "linux":
+    if not BY_CHILDREN:
         table = _table()
         below = {root, *_below(root, table)}
         return sum(rss for number, _, rss in table if number in below)
@@ -129,8 +134,8 @@ def _kill(process: int) -> None:
 
 def _is_dead(process: int) -> bool:
     """Whether a process has ended, waited for or not."""
-    if sys.platform != "linux":
-        return False
+    if not os.path.exists("/proc/self/stat"):
+        return not is_alive(process)
     try:
         with open(f"/proc/{process}/stat", "rb") as file:
             return file.read().rpartition(b")")[2].split()[0] in (b"Z", b"X")
@@ -138,16 +143,18 @@ def _is_dead(process: int) -> bool:
         return True
 
 
-# -- where there is no /proc -----------------------------------------------------------------------
+# -- where /proc doesn't tell children -------------------------------------------------------------
 
 
 def _table() -> list[tuple[int, int, int]]:
-    """All processes as (number, parent, resident bytes), by the program `ps` (POSIX)."""
-    done = subprocess.run(
-        ["ps", "-A", "-o", "pid=,ppid=,rss="], capture_output=True, text=True, check=False
-    )
-    rows = (line.split() for line in done.stdout.splitlines())
-    return [(int(row[0]), int(row[1]), 1024 * int(row[2])) for row in rows if len(row) == 3]
+    """All processes as (number, parent, resident bytes), by the program `ps` (POSIX), without itself."""
+    with subprocess.Popen(
+        ["ps", "-A", "-o", "pid=,ppid=,rss="], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as ps:
+        printed, _ = ps.communicate()
+    rows = (line.split() for line in printed.splitlines())
+    found = [(int(row[0]), int(row[1]), 1024 * int(row[2])) for row in rows if len(row) == 3]
+    return [row for row in found if row[0] != ps.pid]
 
 
 def _below(root: int, table: list[tuple[int, int, int]]) -> list[int]:
@@ -156,7 +163,3 @@ def _below(root: int, table: list[tuple[int, int, int]]) -> list[int]:
         found.extend(number for number, parent, _ in table if parent == found[at])
         at += 1
     return found[1:]
-
-
-def _descendants_by_ps(root: int) -> list[int]:
-    return _below(root, _table())

@@ -132,9 +132,11 @@ def summary(store: Store) -> str:
 def contenders_table(comparison: Comparison) -> str:
     """One row for each contender and model."""
     headings = ["contender", "model", "runs", *STATUSES, "left", "median s", "most s", "most MiB"]
-    rows = []
+    rows, by_name = [], dict[tuple[str, str], list[Row]]()
+    for row in comparison.rows:
+        by_name.setdefault((row["contender"], row["model"]), []).append(row)
     for (contender, model), counts in comparison.coverage().items():
-        mine = [r for r in comparison.rows if (r["contender"], r["model"]) == (contender, model)]
+        mine = by_name.get((contender, model), [])
         well = [seconds_of(row) for row in mine if row["status"] == "ok"]
         memory = [row["peak_memory_bytes"] for row in mine]
         rows.append([

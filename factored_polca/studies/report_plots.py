@@ -168,7 +168,7 @@ def draw_coverage(counts: dict[tuple[str, str], dict[str, int]], ax: Axes, theme
         lefts = [a + b for a, b in zip(lefts, shares, strict=True)]
     ax.set_yticks(list(places), [shown(name, 52) for name in names])
     ax.tick_params(axis="y", length=0)
-    ax.invert_yaxis()
+    ax.set_ylim(len(counts) - 0.5, -0.5)
     ax.set_xlim(0, 100)
     ax.set_xlabel("share of the runs, %; numbers are runs")
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=5)
@@ -317,7 +317,7 @@ def growth_figure(series: Sequence[Series], parameter: str, theme: Theme) -> Fig
     for (quantity, label), ax in zip(quantities, axes, strict=True):
         draw_growth(series, quantity, ax, theme)
         logarithmic(ax, "y", label)
-        ax.set_xlabel(f"{shown(parameter)} (parameter of the model)")
+        ax.set_xlabel(f"{shown(parameter)} (parameter)")
     return figure
 
 

@@ -40,8 +40,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from factored_polca.studies.limits import (
+    BY_CHILDREN,
     Limits,
-    descendants,
+    children,
     is_alive,
     kill_tree,
     process_space,
@@ -51,7 +52,7 @@ from factored_polca.studies.limits import (
 )
 from factored_polca.studies.provenance import now, provenance
 
-TICK: Final = 0.01
+TICK: Final = 0.01 if BY_CHILDREN else 0.25
 IDLE_TICK: Final = 0.5
 LINGER: Final = 5.0
 """Seconds that a run which has told its result may take to end."""
@@ -170,12 +171,12 @@ class Warden:
             if "groups" in message:
                 if message["space"] is not None and message["space"] == process_space():
                     self.client = message["client"]
-                self.prepare(message["groups"])
+                self.prepare(message["groups"], message["fork"])
             else:
                 self.start(message["start"], message["request"])
 
-    def prepare(self, groups: list[dict[str, Any]]) -> None:
-        """Load libraries and kernels, once."""
+    def prepare(self, groups: list[dict[str, Any]], fork: bool) -> None:
+        """Load libraries and kernels, once; runs are forked from here, where that is safe and wanted."""
         from factored_polca.studies import worker, works  # noqa: F401
 
         self.groups = groups
@@ -184,7 +185,7 @@ class Warden:
             with self.ending_with_asker():
                 seconds = worker.warm_kernels(groups)
         threads = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
-        self.forks = threads == 1
+        self.forks = fork and threads == 1
         gc.collect()
         gc.freeze()
         self.answer({
@@ -339,9 +340,9 @@ class Warden:
     def memory(self, going: Going) -> int:
         """The resident bytes of all processes of a run, those included that lost their parent."""
         own = tree_bytes(going.process)
-        if len(self.runs) == len(children := descendants_of_mine()):
+        if len(self.runs) == len(mine := children(os.getpid())):
             return own
-        strays = (c for c in children if c not in self.runs and session_of(c) == going.process)
+        strays = (c for c in mine if c not in self.runs and session_of(c) == going.process)
         return own + sum(map(tree_bytes, strays))
 
     def bury(self) -> None:
@@ -380,17 +381,9 @@ class Warden:
 
     def sweep(self) -> None:
         """Kill children that no run knows any more: their run has ended, or they have left its session."""
-        for child in descendants_of_mine():
+        for child in children(os.getpid()):
             if child not in self.runs and session_of(child) not in self.runs:
                 kill_tree(child)
-
-
-def descendants_of_mine() -> list[int]:
-    """The children of this process."""
-    if sys.platform != "linux":
-        return [child for child in descendants(os.getpid()) if session_of(child) is not None]
-    with open(f"/proc/self/task/{os.getpid()}/children", "rb") as file:
-        return [int(number) for number in file.read().split()]
 
 
 def ending(going: Going, status: int) -> dict[str, Any]:

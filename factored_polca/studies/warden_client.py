@@ -50,11 +50,17 @@ class WorkerLost(RuntimeError):
 class Warden:
     """The near end of a process that starts, supervises and ends runs on this machine."""
 
-    def __init__(self, groups: Sequence[Mapping[str, Any]], client: Client | None = None) -> None:
+    def __init__(
+        self,
+        groups: Sequence[Mapping[str, Any]],
+        client: Client | None = None,
+        *,
+        fork: bool = True,
+    ) -> None:
         """Start it; `groups` are the kinds of runs to come, whose kernels it loads or compiles.
 
         `client` is for whom this is done, if it is another process.  Returns at once: `about` waits
-        until it is ready.
+        until it is ready.  Without `fork` each run starts a new Python, as where forking is not safe.
         """
         self.owner = os.getpid()
         client = client or this_client()
@@ -71,7 +77,8 @@ class Warden:
         self._ready: Future[dict[str, Any]] = Future()
         self._lost = ""
         _WARDENS.append(self)
-        self._send({"groups": list(groups), "client": client["process"], "space": client["space"]})
+        told = {"client": client["process"], "space": client["space"], "fork": fork}
+        self._send({"groups": list(groups)} | told)
         threading.Thread(target=self._listen, daemon=True, name="warden").start()
 
     def about(self) -> dict[str, Any]:

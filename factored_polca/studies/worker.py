@@ -17,6 +17,7 @@ import ctypes
 import faulthandler
 import json
 import os
+import resource
 import signal
 import sys
 import time
@@ -177,6 +178,11 @@ def offer_to_the_memory_killer() -> None:
         file.write("500")
 
 
+def leave_no_core() -> None:
+    """Have no image of the memory written where a run crashes: it would be as large as the run."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
 def enter(parent: int, pipe: int) -> int:
     """Make a forked process a run's: its own session, no files of its parent's but `pipe`; the new number.
 
@@ -188,6 +194,7 @@ def enter(parent: int, pipe: int) -> int:
     os.setsid()
     die_with_parent(parent)
     offer_to_the_memory_killer()
+    leave_no_core()
     faulthandler.enable(2)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
@@ -202,6 +209,7 @@ def fresh_main(pipe: int, parent: int) -> None:
     os.setsid()
     die_with_parent(parent)
     offer_to_the_memory_killer()
+    leave_no_core()
     request = json.load(sys.stdin)
     if any(":" not in group["work"] for group in request["groups"]):
         warm_kernels(request["groups"])
