@@ -123,7 +123,7 @@ def test_two_processes_on_one_store(folder: Path) -> None:
         assert first.returncode == 130
         assert "0 of 1 runs ended" in printed
         assert "goes on from here" in said
-        assert "1 runs are left" in printed
+        assert "one run is left" in printed
     finally:
         first.kill()
         first.wait()

@@ -97,10 +97,11 @@ def progress_text(name: str, progress: Progress) -> str:
     ended = ", ".join(f"{count:,} {status}" for status, count in progress.by_status.items() if count)
     text = f"{name}: {progress.done:,} of {progress.planned:,} runs ended"
     text += f" ({ended})" if ended else ""
+    if progress.seconds_left is not None:
+        text += f"; {duration(progress.seconds_left)} left at this pace"
     if progress.going_on:
         text += f"; {len(progress.going_on)} going on, {progress.going_on[0].title()[:60]}"
-    left = progress.seconds_left
-    return text if left is None else f"{text}; {duration(left)} left at this pace"
+    return text
 
 
 def duration(value: float) -> str:
@@ -181,7 +182,8 @@ def tell(
     if going_on is not None:
         output.line(f"it is being run by {escape(going_on)}")
     elif counts.left:
-        output.line(f"{counts.left:,} runs are left; study run goes on with them")
+        left = "one run is" if counts.left == 1 else f"{counts.left:,} runs are"
+        output.line(f"{left} left; study run goes on")
     output.note(f"results are in {store.path}")
 
 
