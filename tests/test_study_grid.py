@@ -148,6 +148,12 @@ def test_the_number_of_runs_is_capped_before_they_are_made() -> None:
         Study("big", [half, half | {"model": "expon"}])
 
 
+@pytest.mark.parametrize("wrong", [{"seconds": 0}, {"memory_bytes": -1}, {"jobs": 0}])
+def test_limits_are_positive(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ModelError, match=f"{next(iter(wrong))} is .*positive"):
+        Study("s", [LINEAR], **wrong)
+
+
 def test_a_study_without_grids_is_refused() -> None:
     with pytest.raises(ModelError, match="nothing to run"):
         Study("none", [])

@@ -112,6 +112,19 @@ def test_a_model_file_is_run_from_its_text(folder: Path) -> None:
     assert row["stage"] == "reading the model"
 
 
+def test_results_are_a_frame_a_file_and_a_page(folder: Path) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("matplotlib")
+    study = Study("squares", [function("square", set={"n": [2, 3, 5]}, seed=[0, 1])])
+    study.run()
+    frame = study.frame()
+    assert frame.groupby("set.n")["square"].max().to_dict() == {2: 4, 3: 9, 5: 25}
+    assert (frame["finished"] >= frame["started"]).all()
+    study.export("squares.csv")
+    assert (folder / "squares.csv").read_text().count("\n") == 7
+    assert study.report("page").read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
 # -- limits ----------------------------------------------------------------------------------------
 
 

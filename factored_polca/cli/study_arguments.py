@@ -18,8 +18,8 @@ Results are in growth.sqlite beside the file.  Each run has a process of its own
 and memory, and ends as ok, timeout, memout or error.  A name written package.module:name in a study's
 file is imported: run only studies that you trust.
 
-exit status of `study run`: 0 when all runs have a result, whatever it is; 2 where another process is
-running the study; 130 after Ctrl-C.
+exit status of `study run`: 0 when all runs have a result, whatever it is; 1 where nothing can be run any
+more; 2 where another process is running the study; 130 after Ctrl-C.
 """
 
 STATUSES = ("ok", "timeout", "memout", "error")

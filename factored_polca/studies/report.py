@@ -25,6 +25,7 @@ from factored_polca.studies.store import STATUSES, Store
 MOST_ROWS: Final = 500
 """Rows of the table of single runs."""
 MOST_MESSAGES: Final = 30
+MOST_LAUNCHES: Final = 50
 MOST_OPEN: Final = 24
 """Rows of a table that is not folded away."""
 
@@ -250,7 +251,7 @@ def provenance_section(store: Store) -> str:
             one["date"], one["machine"]["host"], (one["commit"] or "")[:12], f"{one['results']:,}",
             brief(" ".join(one["arguments"]), 100),
         ]
-        for one in launches
+        for one in launches[-MOST_LAUNCHES:]
     ]  # fmt: skip
     parts = ["<h2>Provenance</h2>", table(["date", "host", "commit", "results", "arguments"], rows)]
     for one in distinct(supervisors):

@@ -76,6 +76,9 @@ class Study:
                 made.append(grid if isinstance(grid, Grid) else make_grid(grid, ("grid", str(number))))
             except ModelError as error:
                 faults += error.faults
+        for key, most in {"seconds": seconds, "memory_bytes": memory_bytes, "jobs": jobs}.items():
+            if most is not None and not most > 0:
+                faults.append(Fault(f"{key} is {most!r}", (key,), "it must be positive"))
         if not grids:
             faults.append(Fault("there is nothing to run", hint="a study has at least one grid"))
         total = sum(grid.size for grid in made)
