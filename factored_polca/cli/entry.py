@@ -28,7 +28,7 @@ def commands() -> dict[str, Callable[..., int]]:
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
-        "figure": figure.figure, "study": run_study,
+        "figure": figure.figure, "bench": run_bench, "study": run_study,
     }  # fmt: skip
 
 
@@ -44,6 +44,13 @@ def run_study(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.cli.study import study as work
 
     return work(arguments, output)
+
+
+def run_bench(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `bench`."""
+    from factored_polca.cli.bench import bench
+
+    return bench(arguments, output)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
