@@ -72,9 +72,9 @@ def percent(share: float) -> str:
         return "100 %" if share > 0 else "0 %"
     if share < 0.001:
         return "<0.1 %"
-    if share > 0.999:
-        return ">99.9 %"
-    return f"{100 * share:.3g} %"
+    if share > 0.995:
+        return ">99 %"
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
 def seconds_text(seconds: float) -> str:
