@@ -5,6 +5,8 @@ A notebook calls `_repr_html_`.  Nothing of this loads a library, and nothing dr
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class Drawn:
     """Base of objects that show themselves as HTML: inline attributes only, no scripts or style sheets."""
@@ -39,3 +41,19 @@ class DrawnGraph(Drawn):
         from factored_polca.display import mermaid
 
         return mermaid(self)
+
+
+class Framed:
+    """Base of objects that have rows."""
+
+    __slots__ = ()
+
+    def to_frame(self) -> Any:
+        """The rows as a `pandas.DataFrame`; pandas is the extra `[frames]`.
+
+        Raises:
+            MissingLibrary: pandas is not installed.
+        """
+        from factored_polca.display.frames import frame
+
+        return frame(self)

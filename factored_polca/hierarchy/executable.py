@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import INDEX, Diagram, choose, relabel
-from factored_polca.drawn import DrawnGraph
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import planning_order
 from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.minimisation import Partition
@@ -39,7 +39,7 @@ class TaskPolicy(DrawnGraph):
 
 
 @dataclass(frozen=True)
-class ExecutablePlan(DrawnGraph):
+class ExecutablePlan(DrawnGraph, Framed):
     """A hierarchical policy that can be executed, saved and loaded.
 
     `policy` maps each state to the number of the model's action that is taken, or to the number of
