@@ -150,6 +150,14 @@ def test_differences_of_models_are_named() -> None:
         compare(plan_that("safe"), plan_that("safe", walk("3")))
 
 
+def test_a_model_that_is_written_and_read_is_the_same_model() -> None:
+    from factored_polca.formats import read_native, write_native
+
+    for name in fp.domains():
+        model = fp.load_domain(name).model
+        assert model_difference(model, read_native(write_native(model, None)).model) is None, name
+
+
 def test_wrong_numbers_are_refused() -> None:
     plan = plan_that("safe")
     for wrong in ({"episodes": 0}, {"steps": 0}, {"level": 1.0}):

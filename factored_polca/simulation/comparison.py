@@ -15,7 +15,7 @@ Episodes that do not fit side by side run in chunks, each with a seed of its own
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, TypeAlias
@@ -30,11 +30,10 @@ from factored_polca.control.tracker import Belief
 from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.arrays import FloatArray
 from factored_polca.explicit.policies import horizon_of
-from factored_polca.formats import write_native
 from factored_polca.hierarchy.executable import ExecutablePlan
 from factored_polca.hierarchy.policy_file import FlatPolicy
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
-from factored_polca.models import Action, Model, ModelError
+from factored_polca.models import Action, Model, ModelError, Value
 from factored_polca.simulation.belief_episodes import episodes_at_once, run_one_by_one
 from factored_polca.simulation.belief_runs import (
     BELIEF_NUMBERS,
@@ -312,10 +311,8 @@ def _tracked(plan: ExecutablePlan | ExecutablePomdpPlan, seed: int) -> Runner:
 def model_difference(first: Model, second: Model) -> str | None:
     """What tells two models apart, in words; None where they are the same but for names and descriptions.
 
-    Models are compared as they are written: with values of parameters put in, but without algebra.
+    Expressions are compared as they are written, without algebra.
     """
-    if _written(first) == _written(second):
-        return None
     for what, one, other in (
         ("features", [f.name for f in first.features], [f.name for f in second.features]),
         ("actions", [a.name for a in first.actions], [a.name for a in second.actions]),
@@ -324,29 +321,27 @@ def model_difference(first: Model, second: Model) -> str | None:
         if one != other:
             return f"one has the {what} {_listed_names(one)}, the other {_listed_names(other)}"
     for mine, theirs in zip(first.features, second.features, strict=True):
-        if mine.values != theirs.values or mine.observed != theirs.observed:
+        if _typed(mine.values) != _typed(theirs.values) or mine.observed != theirs.observed:
             return f"the values of feature {mine.name!r} differ, or whether it is seen"
+    for channel, like in zip(first.observations, second.observations, strict=True):
+        if _typed((*channel.values, channel.null)) != _typed((*like.values, like.null)):
+            return f"the values of observation {channel.name!r} differ"
     for a, b in zip(first.actions, second.actions, strict=True):
         if (part := _action_difference(a, b)) is not None:
             return f"action {a.name!r} has another {part}"
-    for name in (
-        "discount",
-        "observability",
-        "horizon",
-        "parameters",
-        "observations",
-        "terminal",
-        "rewards",
-    ):
+    for name in ("discount", "observability", "horizon", "terminal", "rewards"):
         if getattr(first, name) != getattr(second, name):
             return f"they differ in {name}"
-    return "they differ at the start" if first.initial != second.initial else "they are written differently"
+    if dict(first.parameters) != dict(second.parameters):
+        return "they differ in parameters"
+    begun, other_begun = first.initial, second.initial
+    same = dict(begun.distributions) == dict(other_begun.distributions)
+    return None if same and begun.factors == other_begun.factors else "they differ at the start"
 
 
-def _written(model: Model) -> str:
-    from factored_polca.models.model import replace_fields
-
-    return write_native(replace_fields(model, name="model", description=""), None)
+def _typed(values: Sequence[Value]) -> list[tuple[bool, Value]]:
+    """Values such that `True` is not 1."""
+    return [(isinstance(value, bool), value) for value in values]
 
 
 def _action_difference(a: Action, b: Action) -> str | None:

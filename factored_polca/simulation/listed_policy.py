@@ -18,15 +18,15 @@ from factored_polca.explicit.exact_pomdp import observation_label
 from factored_polca.explicit.policy_graph import PolicyGraph
 from factored_polca.explicit.state_policy import StatePolicy
 from factored_polca.hierarchy.policy_file import FlatPolicy
-from factored_polca.minimisation.flat_model import FlatModel
 from factored_polca.models import ModelError
 from factored_polca.simulation.sampler import States
 
 
 class ListedStates:
-    """The numbers of states [episode, feature] in a list."""
+    """The numbers of states [episode, feature] in the list that a policy is for."""
 
-    def __init__(self, flat: FlatModel) -> None:
+    def __init__(self, policy: FlatPolicy) -> None:
+        flat = policy.flat
         sizes = [len(feature.values) for feature in flat.symbolic.model.features]
         weights = [1]
         for size in reversed(sizes[1:]):
@@ -58,7 +58,7 @@ class ListedActions:
     def __init__(self, policy: FlatPolicy) -> None:
         if not isinstance(policy.policy, StatePolicy):
             raise ModelError("the state is seen, and the policy is one over beliefs")
-        self.policy, self.listed = policy.policy, ListedStates(policy.flat)
+        self.policy, self.listed = policy.policy, ListedStates(policy)
 
     def __call__(self, states: States, step: int) -> IntArray:
         return self.policy.choose(self.listed.number(states), step)
@@ -72,7 +72,7 @@ class ListedMinds:
     def __init__(self, policy: FlatPolicy, count: int) -> None:
         self.flat, self.policy, self.step = policy.flat, policy.policy, 0
         self.pomdp = policy.flat.pomdp
-        self.listed = ListedStates(policy.flat)
+        self.listed = ListedStates(policy)
         self.live = ~self.pomdp.terminal
         self.nodes = np.full(count, -1, dtype=np.int64)
         wide = 0 if isinstance(self.policy, (PolicyGraph, StatePolicy)) else self.pomdp.states
