@@ -15,7 +15,10 @@ from factored_polca.simulation.trace import Trace
 
 SHOWN_STEPS: Final = 60
 SHOWN_VALUES: Final = 3
-LONGEST: Final = 120
+LONGEST: Final = 160
+
+SURE: Final = 0.995
+"""A value that is likelier is called certain."""
 
 
 def html(trace: Trace) -> str:
@@ -62,9 +65,11 @@ def same(one: Value, other: Value) -> bool:
 
 
 def told(model: Model, beliefs: Mapping[str, FloatArray]) -> str:
-    """The features that are not certain, likeliest values first."""
+    """The features that are not certain, the least certain first, and of each its likeliest values."""
     parts = []
-    for name, chances in beliefs.items():
+    for name, chances in sorted(beliefs.items(), key=lambda pair: float(pair[1].max())):
+        if chances.max() > SURE:
+            continue
         order = [v for v in np.argsort(-chances, kind="stable").tolist() if chances[v] > 5e-4]
         if len(order) > 1:
             values = model.feature(name).values
