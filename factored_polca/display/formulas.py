@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, Literal, TypeAlias
 
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Diagram, node_count
 from factored_polca.display.covers import Budget, Condition, Cube, TooLong, cover
 from factored_polca.display.nodes import Nodes, read_nodes
 from factored_polca.display.symmetry import count_vectors, one_value
@@ -105,12 +105,12 @@ def formula(symbolic: SymbolicModel, condition: Diagram, budget: Budget | None =
     Raises:
         ValueError: the diagram tests something other than present features.
     """
+    if node_count(condition) > LARGEST_DIAGRAM:
+        return None
     nodes = read_nodes(condition)
     features = {symbolic.now(k): feature for k, feature in enumerate(symbolic.model.features)}
     if not set(nodes.support) <= set(features):
         raise ValueError("a formula is made of a condition over present features")
-    if len(nodes.levels) > LARGEST_DIAGRAM:
-        return None
     budget = Budget(STEPS) if budget is None else budget
     tested = [features[level] for level in nodes.support]
     sizes = [len(feature.values) for feature in tested]
