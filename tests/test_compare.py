@@ -166,6 +166,18 @@ def test_wrong_numbers_are_refused() -> None:
             compare(plan, plan, **wrong)  # type: ignore[arg-type]
 
 
+def test_plans_fresh_from_the_planner_are_run_as_they_are() -> None:
+    model = walk()
+    made = fp.plan(model, fp.TaskHierarchy([fp.Task("only", ["safe"])]))
+    found = compare(made, fp.executable(made), episodes=5)  # type: ignore[arg-type]
+    assert found.ties == 5
+    assert trace(made, steps=3).steps[0].action == "safe"
+    with pytest.raises(TypeError, match="Model can't be run; what can: a plan"):
+        compare(model, made)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="has no trace"):
+        trace(tiger_policies()["blind"])
+
+
 def test_one_episode_has_no_error() -> None:
     found = compare(plan_that("safe"), plan_that("bold"), episodes=1)
     assert math.isnan(found.standard_error)
