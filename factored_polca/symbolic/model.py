@@ -34,11 +34,12 @@ from factored_polca.diagrams import (
     states_for_leaves,
     support,
 )
-from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, Value, check
+from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, check
 from factored_polca.models.expressions import ZERO, Expression, Reference, references
 from factored_polca.models.scalars import Undefined, describe
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, Variable, row_of, used
 from factored_polca.symbolic.initial import compile_initial
+from factored_polca.symbolic.names import LevelNames
 from factored_polca.symbolic.observations import (
     compile_observations,
     expect_observations,
@@ -127,22 +128,6 @@ class SymbolicModel:
         return ", ".join(f"{f.name}={_show(f.values[v])}" for f, v in pairs)
 
 
-@dataclass(frozen=True)
-class _Names:
-    """What the levels of a manager stand for."""
-
-    model: Model
-    order: tuple[str, ...]
-
-    def describe(self, level: int) -> tuple[str, tuple[Value, ...]]:
-        """The name of a level, primed for a next feature, and its values."""
-        if level >= 2 * len(self.order):
-            channel = self.model.observations[level - 2 * len(self.order)]
-            return channel.name, channel.values
-        feature = self.model.feature(self.order[level // 2])
-        return feature.name + "'" * (level % 2), feature.values
-
-
 def _show(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -182,7 +167,7 @@ def compile_model(
     sizes += [len(channel.values) for channel in model.observations]
     manager = Manager(sizes, memory_limit=memory_limit)
     manager.deadline = deadline
-    manager.describe = _Names(model, names).describe
+    manager.describe = LevelNames(model, names).describe
     levels = {
         Reference(name, primed): 2 * position[index] + primed
         for name, index in features.items()
@@ -285,11 +270,8 @@ class _Build:
         self.faults.append(Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}"))
 
     def level_text(self, level: int, value: int) -> str:
-        if level >= 2 * len(self.order):
-            channel = self.model.observations[level - 2 * len(self.order)]
-            return f"{channel.name}={_show(channel.values[value])}"
-        feature = self.model.feature(self.order[level // 2])
-        return f"{feature.name}{chr(39) if level % 2 else ''}={_show(feature.values[value])}"
+        name, values = LevelNames(self.model, self.order).describe(level)
+        return f"{name}={_show(values[value])}"
 
     # -- actions ---------------------------------------------------------------------------
 
