@@ -30,6 +30,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "command_help",
+    "drawn",
     "mathml",
 ]
 exclude_patterns = ["out", "_build", "notebooks/README.md"]
