@@ -16,6 +16,9 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_extensions"))
 
+from pygments.lexers.special import TextLexer  # noqa: E402
+from sphinx.application import Sphinx  # noqa: E402
+
 import factored_polca  # noqa: E402
 
 project = "factored_polca"
@@ -45,11 +48,11 @@ myst_enable_extensions = ["dollarmath", "deflist", "colon_fence", "attrs_inline"
 myst_heading_anchors = 3
 html_math_renderer = "mathml"  # formulas need neither a network nor a script
 
-# Fences of README's kinds that no lexer knows.
+# In docstrings one backtick is code.
 default_role = "code"
 highlight_language = "none"
 
-# The reference, from docstrings: one backtick is code there.
+# The reference, from docstrings.
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
@@ -91,3 +94,9 @@ nb_execution_mode = "off" if copy_notebooks() else "cache"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_merge_streams = True
+
+
+def setup(app: Sphinx) -> None:
+    """Fences of README's kinds are plain text: commands with what they print."""
+    for kind in ("console", "dialogue", "output"):
+        app.add_lexer(kind, TextLexer)
