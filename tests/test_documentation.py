@@ -29,9 +29,10 @@ def named(path: Path) -> str:
 
 
 def prose(text: str) -> str:
-    """The page without its fenced blocks and code."""
+    """The page without its fenced blocks, code and formulas."""
     text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
-    return re.sub(r"`[^`\n]*`", "", text)
+    text = re.sub(r"`[^`\n]*`", "", text)
+    return re.sub(r"\$\$.*?\$\$|\$[^$\n]+\$", "", text, flags=re.DOTALL)
 
 
 def links(page: Path) -> Iterator[tuple[str, str]]:
