@@ -221,6 +221,11 @@ class Manager:
         if self.head[0] > self._collect_at:
             self.collect_garbage()
 
+    @property
+    def collect_at(self) -> int:
+        """The end of the pool beyond which the next safe point collects garbage."""
+        return self._collect_at
+
     def _plan_collection(self) -> None:
         """Collect when the store has doubled, earlier where the memory limit is near."""
         room = len(self.pool)
