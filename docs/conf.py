@@ -34,6 +34,7 @@ extensions = [
     "sphinx_copybutton",
     "command_help",
     "drawn",
+    "further_names",
     "mathml",
 ]
 exclude_patterns = ["out", "_build", "notebooks/README.md"]
