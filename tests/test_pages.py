@@ -34,7 +34,7 @@ def run_commands(block: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def told(text: str) -> list[str]:
-    """What a command printed, without how much its diagrams took on the way: that is for the kernel to say."""
+    """What a command printed, but for how large its diagrams were on the way, which the kernel may change."""
     return [line for line in comparable(text) if not line.startswith("diagram nodes (peak)")]
 
 
