@@ -3,7 +3,7 @@
     ```{drawn} NAME WHAT
     ```
 
-NAME is the name in one of the page's TOML blocks; WHAT is `model`, `tasks` or `plan`.
+NAME is the name in one of the page's TOML blocks; WHAT is `model`, `tasks`, `plan` or `root`, the plan's task at the top.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def drawings(text: str) -> dict[str, str]:
         path = Path(folder) / "model.toml"
         path.write_text(text, encoding="utf-8")
         document = fp.read(path)
-    things = {"model": document.model, "plan": fp.plan(document.model, document.tasks)}
+    plan = fp.plan(document.model, document.tasks)
+    things = {"model": document.model, "plan": plan, "root": plan.root}
     if document.tasks is not None:
         things["tasks"] = document.tasks
     return {name: thing._repr_html_() for name, thing in things.items()}
