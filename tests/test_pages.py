@@ -34,7 +34,7 @@ def run_commands(block: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def told(text: str) -> list[str]:
-    """What a command printed, but for how large its diagrams were on the way, which the kernel may change."""
+    """What a command printed, but for how large its diagrams were on the way: the kernel's affair."""
     return [line for line in comparable(text) if not line.startswith("diagram nodes (peak)")]
 
 

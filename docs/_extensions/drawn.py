@@ -3,7 +3,8 @@
     ```{drawn} NAME WHAT
     ```
 
-NAME is the name in one of the page's TOML blocks; WHAT is `model`, `tasks`, `plan` or `root`, the plan's task at the top.
+NAME is the name in one of the page's TOML blocks; WHAT is `model`, `tasks`, `plan`, or `root`, the plan's
+task at the top.
 """
 
 from __future__ import annotations
