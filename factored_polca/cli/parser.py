@@ -18,6 +18,7 @@ from factored_polca.cli.argument_types import (
     size,
     solver,
 )
+from factored_polca.cli.compare_arguments import add_comparing
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
 hierarchies: each subtask is minimised exactly on decision diagrams, without enumerating states, and
@@ -173,6 +174,9 @@ def parser() -> argparse.ArgumentParser:
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
+    add_comparing(
+        command("compare", "Compare two plans, or policies, of one model on the same random numbers.")
+    )
     add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,9 @@ class Manager:
         self.leaf_level = len(self.sizes)
         self.memory_limit = available_memory() * 3 // 4 if memory_limit is None else memory_limit
         self.deadline: float | None = None
+        self.describe: Callable[[int], tuple[str, tuple[Any, ...]]] | None = (
+            None  # a level's name and values
+        )
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0
@@ -227,11 +230,14 @@ class Manager:
         return self._collect_at
 
     def _plan_collection(self) -> None:
-        """Collect when the store has doubled, earlier where the memory limit is near."""
+        """Collect when the store has trebled, earlier where the memory limit is near.
+
+        Small stores are quick ones: what fits into the processor's caches.
+        """
         room = len(self.pool)
         if self.bytes + 4 * (2 * room) <= self.memory_limit:
             room *= 2
-        self._collect_at = min(max(1 << 22, 2 * self._live), (self._live + room) // 2)
+        self._collect_at = min(max(1 << 18, 3 * self._live), (self._live + room) // 2)
 
     def collect_garbage(self) -> None:
         """Drop every node that no diagram reaches; all handles stay valid, caches are emptied.

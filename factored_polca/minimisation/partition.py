@@ -25,11 +25,12 @@ from factored_polca.diagrams import (
     states_for_leaves,
     states_of_leaves,
 )
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.symbolic import SymbolicModel
 
 
 @dataclass(frozen=True)
-class Partition:
+class Partition(Drawn, Framed):
     """Blocks 0 .. blocks-1; the leaf `blocks` is outside, where `has_outside`."""
 
     symbolic: SymbolicModel

@@ -34,7 +34,7 @@ from factored_polca.diagrams import (
     states_for_leaves,
     support,
 )
-from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, check
+from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, Value, check
 from factored_polca.models.expressions import ZERO, Expression, Reference, references
 from factored_polca.models.scalars import Undefined, describe
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, Variable, row_of, used
@@ -127,6 +127,22 @@ class SymbolicModel:
         return ", ".join(f"{f.name}={_show(f.values[v])}" for f, v in pairs)
 
 
+@dataclass(frozen=True)
+class _Names:
+    """What the levels of a manager stand for."""
+
+    model: Model
+    order: tuple[str, ...]
+
+    def describe(self, level: int) -> tuple[str, tuple[Value, ...]]:
+        """The name of a level, primed for a next feature, and its values."""
+        if level >= 2 * len(self.order):
+            channel = self.model.observations[level - 2 * len(self.order)]
+            return channel.name, channel.values
+        feature = self.model.feature(self.order[level // 2])
+        return feature.name + "'" * (level % 2), feature.values
+
+
 def _show(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -166,6 +182,7 @@ def compile_model(
     sizes += [len(channel.values) for channel in model.observations]
     manager = Manager(sizes, memory_limit=memory_limit)
     manager.deadline = deadline
+    manager.describe = _Names(model, names).describe
     levels = {
         Reference(name, primed): 2 * position[index] + primed
         for name, index in features.items()
