@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_extensions"))
 
+from pygments.lexers import get_all_lexers  # noqa: E402
 from pygments.lexers.special import TextLexer  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 
@@ -98,6 +100,13 @@ nb_merge_streams = True
 
 
 def setup(app: Sphinx) -> None:
-    """Fences of README's kinds are plain text: commands with what they print."""
-    for kind in ("console", "dialogue", "output"):
+    """Show fences of kinds that no lexer knows, and commands with what they print, as plain text."""
+    pages = [path for path in HERE.rglob("*.md") if "out" not in path.parts]
+    kinds = {
+        kind
+        for path in pages
+        for kind in re.findall(r"^```([a-z]\w*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    known = {name for _, names, _, _ in get_all_lexers() for name in names}
+    for kind in sorted({"console", "output"} | kinds - known):
         app.add_lexer(kind, TextLexer)
