@@ -13,6 +13,7 @@ from belief_plans import corridor
 
 import factored_polca as fp
 from factored_polca.cli import main
+from factored_polca.control import ChosenTracker, DiagramTracker
 from factored_polca.explicit.alpha_vectors import AlphaSet, AlphaVectors
 from factored_polca.explicit.policy_graph import PolicyGraph
 from factored_polca.explicit.state_policy import StatePolicy
@@ -165,6 +166,18 @@ def test_wrong_numbers_are_refused() -> None:
             compare(plan, plan, **wrong)  # type: ignore[arg-type]
 
 
+def test_plans_fresh_from_the_planner_are_run_as_they_are() -> None:
+    model = walk()
+    made = fp.plan(model, fp.TaskHierarchy([fp.Task("only", ["safe"])]))
+    found = compare(made, fp.executable(made), episodes=5)  # type: ignore[arg-type]
+    assert found.ties == 5
+    assert trace(made, steps=3).steps[0].action == "safe"
+    with pytest.raises(TypeError, match="Model can't be run; what can: a plan"):
+        compare(model, made)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="has no trace"):
+        trace(tiger_policies()["blind"])
+
+
 def test_one_episode_has_no_error() -> None:
     found = compare(plan_that("safe"), plan_that("bold"), episodes=1)
     assert math.isnan(found.standard_error)
@@ -241,6 +254,42 @@ def test_observed_features_and_ends_are_tracked_by_listed_policies() -> None:
     )  # fmt: skip
     assert found.ties == 300
     assert found.unpaired_standard_error > 0
+
+
+def test_beliefs_that_are_tracked_one_by_one_lead_to_the_same_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two exact trackers, over blocks and as diagrams, earn the same in each episode."""
+    plan = fp.executable_pomdp(fp.plan(fp.load_domain("tiger").model))  # type: ignore[arg-type]
+    kinds = [module.plan_tracker(plan), ChosenTracker(DiagramTracker(plan.symbolic), "")]
+    monkeypatch.setattr(module, "plan_tracker", lambda *_, **__: kinds[0])
+    monkeypatch.setattr(module, "episodes_at_once", lambda _: 5)
+    first = module.runner_of(plan, 0)
+    kinds[0] = kinds[1]
+    second = module.runner_of(plan, 0)
+    assert (first.slow, second.slow) == (False, True)
+    for seed in (4, 9):
+        assert first.run(5, 15, seed).returns.tolist() == pytest.approx(
+            second.run(5, 15, seed).returns.tolist()
+        )
+    one_by_one = compare(plan, plan, episodes=12, steps=15, seed=4)
+    assert one_by_one.ties == 12
+
+
+def test_a_plan_as_if_the_state_were_seen_is_compared_at_the_likeliest_state() -> None:
+    """PolCA in the tiger problem opens the likelier door at once: 10 * 0.5 - 100 * 0.5 = -45 a step."""
+    model = fp.load_domain("tiger").model
+    seen = fp.executable(fp.plan(model, None, fp.Options(assume_observed=True)))  # type: ignore[arg-type]
+    plus = fp.executable_pomdp(fp.plan(model))  # type: ignore[arg-type]
+    found = compare(plus, seen, episodes=400, steps=10, seed=3)
+    weight = (1 - 0.95**10) / 0.05
+    deviation = 55 * math.sqrt((1 - 0.95**20) / (1 - 0.95**2))
+    assert float(found.second_returns.mean()) == pytest.approx(-45 * weight, abs=4 * deviation / 20)
+    assert found.interval[0] > 0
+    episode = trace(seen, steps=4, seed=1)
+    assert {step.action for step in episode.steps} <= {"open_left", "open_right"}
+    assert len(episode.steps) == 4
+    assert episode.belief_over_time("tiger")[1:] == pytest.approx(np.full((4, 2), 0.5))
 
 
 def test_policies_of_states_are_compared_with_plans() -> None:

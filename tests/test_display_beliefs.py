@@ -91,8 +91,9 @@ def test_a_policy_of_states_is_a_table_of_actions() -> None:
     shown = policy._repr_html_()
     assert "Pickup" in shown
     assert "such as" in shown
-    with pytest.raises(TypeError, match="no graph"):
-        display.graph(policy)
+    assert "not reached" in shown
+    first = display.graph(policy).nodes[0]
+    assert first.lines == ("passenger",)
     assert "at most" in found._repr_html_()
 
 
@@ -172,3 +173,23 @@ def test_charts_hold_every_point_inside_their_frame() -> None:
     assert "mean 3.25" in bars
     assert histogram(np.array([]), "", "", "") == ""
     assert line_chart([], "", "", "") == ""
+
+
+def test_a_function_of_listed_states_becomes_its_diagram() -> None:
+    """Random functions of random lists of states, read back one by one."""
+    from itertools import product
+
+    from factored_polca.diagrams import at
+    from factored_polca.display.flat_policy_view import listed_function
+
+    symbolic = fp.compile_model(fp.load_domain("taxi").model)
+    sizes = [len(feature.values) for feature in symbolic.model.features]
+    draw = np.random.default_rng(3)
+    everything = np.array(list(product(*map(range, sizes))), dtype=np.int32)
+    mine = draw.permutation(len(everything))[:200]
+    values = draw.integers(0, 3, len(mine))
+    diagram = listed_function(symbolic, everything[mine], values, 7)
+    told = {tuple(everything[k].tolist()): int(v) for k, v in zip(mine, values, strict=True)}
+    for state in everything.tolist():
+        levels = {symbolic.now(k): v for k, v in enumerate(state)}
+        assert at(diagram, levels) == told.get(tuple(state), 7)

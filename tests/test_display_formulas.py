@@ -191,3 +191,115 @@ def test_only_present_features_make_a_formula() -> None:
 def test_sizes_of_formulas() -> None:
     test = Membership(fp.Feature("x", range(3)), frozenset({1}))
     assert size(test) > size(TRUE) == size(FALSE) == 0
+
+
+# -- conditions that only count ---------------------------------------------------------------------------
+
+
+def counting_model(count: int, values: int) -> SymbolicModel:
+    features = [fp.Feature(f"c{k}", range(values)) for k in range(count)]
+    return fp.compile_model(Model("parts", features, [fp.Action("wait", {})]))
+
+
+def labelled(symbolic: SymbolicModel, value: Any) -> Diagram:
+    """The condition that `value` of the counts of values holds, made state by state."""
+    manager, model = symbolic.manager, symbolic.model
+    result = manager.constant(0)
+    for numbers in product(*(range(len(f.values)) for f in model.features)):
+        if value([numbers.count(v) for v in range(len(model.features[0].values))]):
+            cell = manager.constant(1)
+            for k, v in enumerate(numbers):
+                cell = cell & manager.indicator(symbolic.now(k), [v])
+            result = result | cell
+    return result
+
+
+@pytest.mark.parametrize(
+    ("count", "values", "condition", "expected"),
+    [
+        (6, 2, lambda k: k[1] == 3, "exactly 3 of c0 .. c5 == 0"),
+        (6, 2, lambda k: k[0] >= 2, "at least 2 of c0 .. c5 == 0"),
+        (6, 2, lambda k: 2 <= k[1] <= 3, "3 to 4 of c0 .. c5 == 0"),
+        (5, 3, lambda k: k == [2, 2, 1], "exactly 2 of c0 .. c4 == 1 and exactly 1 of c0 .. c4 == 2"),
+        (5, 3, lambda k: k == [3, 2, 0], "exactly 3 of c0 .. c4 == 0 and exactly 2 of c0 .. c4 == 1"),
+        (5, 3, lambda k: k[2] <= 3 and k[2] >= 1, "1 to 3 of c0 .. c4 == 2"),
+    ],
+)
+def test_what_only_counts_is_said_by_counting(
+    count: int, values: int, condition: Any, expected: str
+) -> None:
+    symbolic = counting_model(count, values)
+    found = formula(symbolic, labelled(symbolic, condition))
+    assert found is not None
+    for state in states_of(symbolic.model):
+        counts = [list(state.values()).count(v) for v in range(values)]
+        assert found.holds(state) is condition(counts)
+    assert text(found, names_of(symbolic)) == expected
+
+
+def test_what_is_not_symmetric_is_not_counted() -> None:
+    from factored_polca.display.symmetry import count_vectors
+
+    symbolic = counting_model(5, 2)
+    manager = symbolic.manager
+    some = labelled(symbolic, lambda k: k[0] == 2)
+    first = manager.indicator(symbolic.now(0), [0])
+    for condition in (some & first, some | first, first, some ^ manager.indicator(symbolic.now(4), [1])):
+        nodes = read_nodes(condition)
+        assert count_vectors(nodes, [2] * len(nodes.support), Budget(10**6)) is None
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_symmetry_is_found_exactly_where_all_exchanges_leave_a_condition_as_it_is(seed: int) -> None:
+    """Random conditions of count vectors, some of them spoilt at one state, against all permutations."""
+    import random
+    from itertools import permutations
+
+    from factored_polca.display.symmetry import count_vectors
+
+    draw = random.Random(seed)
+    count, values = 4, draw.choice((2, 3))
+    symbolic = counting_model(count, values)
+    vectors = [v for v in product(range(count + 1), repeat=values) if sum(v) == count]
+    chosen = set(draw.sample(vectors, draw.randint(1, len(vectors) - 1)))
+    table = {
+        point: tuple(point.count(v) for v in range(values)) in chosen
+        for point in product(range(values), repeat=count)
+    }
+    if seed % 2:
+        spoilt = draw.choice(list(table))
+        table[spoilt] = not table[spoilt]
+    condition = symbolic.manager.constant(0)
+    for point, true in table.items():
+        if true:
+            cell = symbolic.manager.constant(1)
+            for k, v in enumerate(point):
+                cell = cell & symbolic.manager.indicator(symbolic.now(k), [v])
+            condition = condition | cell
+    nodes = read_nodes(condition)
+    symmetric = all(
+        table[point] == table[tuple(point[k] for k in order)]
+        for point in table
+        for order in permutations(range(count))
+    )
+    if len(nodes.support) < count:
+        return
+    found = count_vectors(nodes, [values] * count, Budget(10**6))
+    assert (found is not None) is symmetric
+    if symmetric:
+        assert found == {
+            tuple(point.count(v) for v in range(values)) for point, true in table.items() if true
+        }
+
+
+def test_blocks_of_interchangeable_parts_are_told_by_counting() -> None:
+    """`components`: what counts is how many parts are in which condition; C(17, 2) = 136 blocks of 3^15."""
+    symbolic = fp.compile_model(fp.load_domain("components", {"size": 15}).model)
+    partition = fp.minimise(fp.flat_process(symbolic)).partition
+    assert partition.blocks == 136
+    formulas = list(block_formulas(partition, 4))
+    assert formulas[1:3] == [
+        "exactly 14 of c_0 .. c_14 == ok and exactly 1 of c_0 .. c_14 == degraded",
+        "exactly 14 of c_0 .. c_14 == ok and exactly 1 of c_0 .. c_14 == failed",
+    ]
+    assert "no short formula" not in "".join(formulas)

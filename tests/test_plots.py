@@ -69,6 +69,8 @@ def test_the_exponent_of_a_power_law_is_found(exponent: float, factor: float) ->
     sizes = [2.0, 10.0, 64.0, 5000.0]
     values = [factor * n**exponent for n in sizes]
     assert plots.fitted_exponent(sizes, values) == pytest.approx((exponent, factor))
+    powers = [2**1000, 2**2000, 2**3000]  # more than a float holds
+    assert plots.fitted_exponent(powers, [2.0, 4.0, 8.0])[0] == pytest.approx(0.001)
 
 
 @pytest.mark.parametrize(("sizes", "values"), [([1, 1], [1, 2]), ([1, 2], [0, 1]), ([], [])])

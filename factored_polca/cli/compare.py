@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from factored_polca.cli.output import Output, escape
 
 if TYPE_CHECKING:
-    from factored_polca.simulation.comparison import AnyPlan, Comparison
+    from factored_polca.simulation.comparison import Comparison
+    from factored_polca.simulation.runnable import AnyPlan
 
 
 def compare(arguments: argparse.Namespace, output: Output) -> int:

@@ -20,6 +20,11 @@ from factored_polca.explicit.arrays import FloatArray
 WIDTH: Final = 520.0
 HEIGHT: Final = 220.0
 SMALL: Final = 10.5
+
+BLUE: Final = "#3a8fd0"
+RED: Final = "#e2691f"
+"""Between light and dark, so that thin lines are seen on both."""
+
 MOST_POINTS: Final = 400
 
 
@@ -118,12 +123,12 @@ def histogram(
             x, y = frame.x(float(a)), frame.y(count)
             parts.append(
                 f'<rect x="{n(x + 0.5)}" y="{n(y)}" width="{n(frame.x(float(b)) - x - 1)}" '
-                f'height="{n(frame.y(0) - y)}" fill="#0072b2" fill-opacity="0.45"/>'
+                f'height="{n(frame.y(0) - y)}" fill="{BLUE}" fill-opacity="0.55"/>'
             )
     if mean is not None and low <= mean <= high:
         at = n(frame.x(mean))
         parts.append(
-            f'<line x1="{at}" y1="{n(frame.top)}" x2="{at}" y2="{n(frame.y(0))}" stroke="#d55e00" '
+            f'<line x1="{at}" y1="{n(frame.top)}" x2="{at}" y2="{n(frame.y(0))}" stroke="{RED}" '
             f'stroke-width="1.6"><title>{escape(f"mean {number_text(mean)}")}</title></line>'
         )
     return picture(WIDTH, HEIGHT, parts, description, alone=False)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from factored_polca.diagrams import Diagram, Manager
+import numpy as np
+
+from factored_polca.diagrams import Diagram, Manager, node_count
 from factored_polca.diagrams.leaves import describe
+from factored_polca.diagrams.nodes import Int32Array
+from factored_polca.diagrams.operations import Walk, leaf_payloads
 from factored_polca.display.graphs import Edge, Graph, Node
-from factored_polca.display.nodes import Nodes, read_nodes
 from factored_polca.display.tables import drawing, heading, table, view
 from factored_polca.display.words import (
     count_text,
@@ -26,21 +29,15 @@ SHOWN_LEVELS: Final = 30
 
 def html(diagram: Diagram) -> str:
     """The picture; of a large diagram its upper part, and how many nodes each level has."""
-    nodes = read_nodes(diagram)
-    leaves = sum(1 for below in nodes.children if not below)
-    detail = f"{plural(len(nodes.levels), 'node')}, of which {plural(leaves, 'leaf')}".replace(
-        "leafs", "leaves"
-    )
+    walk = Walk(diagram)
+    count, leaves = len(walk.nodes), int(walk.is_leaf.sum())
+    detail = f"{plural(count, 'node')}, of which {count_text(leaves)} {'leaf' if leaves == 1 else 'leaves'}"
+    levels = walk.levels.copy()
     return view(
         heading("decision diagram", f"{detail}, {describe(diagram.leaf_type)} values"),
-        drawing(_graph(diagram.manager, nodes)),
-        _levels(diagram.manager, nodes) if len(nodes.levels) > SHOWN_NODES else "",
+        drawing(graph(diagram)),
+        _levels(diagram.manager, levels) if count > SHOWN_NODES else "",
     )
-
-
-def graph(diagram: Diagram) -> Graph:
-    """Nodes and arcs, those nearest to the top."""
-    return _graph(diagram.manager, read_nodes(diagram))
 
 
 def level_name(manager: Manager, level: int) -> tuple[str, tuple[Value, ...]]:
@@ -60,54 +57,67 @@ def arc_text(values: tuple[Value, ...], some: tuple[int, ...]) -> str:
     return values_text([values[k] for k in some], 4)
 
 
-def _graph(manager: Manager, nodes: Nodes) -> Graph:
-    shown = _nearest(nodes)
-    drawn, edges, cut = [], list[Edge](), False
-    for node in shown:
-        below = nodes.children[node]
-        if not below:
-            leaf = nodes.leaves[node]
-            text = (
-                number_text(leaf)
-                if isinstance(leaf, float)
-                else value_text(leaf if leaf is not None else 0)
-            )
-            drawn.append(Node(str(node), (short(text),), "terminal", heading=False))
+def graph(diagram: Diagram) -> Graph:
+    """Nodes and arcs, those nearest to the top."""
+    manager, count = diagram.manager, node_count(diagram)
+    shown = _nearest(diagram)
+    drawn, edges, cut = [], list[Edge](), set[int]()
+    for node, groups in shown.items():
+        if not groups:
+            drawn.append(Node(str(node), (_leaf_text(diagram, node),), "terminal", heading=False))
             continue
-        name, values = level_name(manager, nodes.levels[node])
+        name, values = level_name(manager, int(manager.pool[node]))
         drawn.append(Node(str(node), (short(name),), "test", printable(name), heading=False))
-        for child, some in nodes.groups(node):
-            target = str(child) if child in shown else "more"
-            cut = cut or target == "more"
+        for child, some in groups.items():
             title = f"{name}: {', '.join(value_text(values[k]) for k in some[:50])}"
-            edges.append(Edge(str(node), target, arc_text(values, some), title=title))
-    left = len(nodes.levels) - len(shown)
+            if child in shown:
+                edges.append(Edge(str(node), str(child), arc_text(values, tuple(some)), title=title))
+            else:
+                cut.add(node)
+    edges += [Edge(str(node), "more", stroke="faint") for node in shown if node in cut]
     if cut:
-        drawn.append(Node("more", (f"… {plural(left, 'more node')}",), "more", heading=False))
+        more = f"… {plural(count - len(shown), 'more node')}"
+        drawn.append(Node("more", (more,), "more", heading=False))
     note = f"shown: the {len(shown)} nodes nearest to the top" if cut else ""
-    return Graph(
-        tuple(drawn), tuple(edges), "Decision diagram: tests of features, values on arcs", "auto", note
-    )
+    text = "Decision diagram: tests of features, values on arcs"
+    return Graph(tuple(drawn), tuple(edges), text, "auto", note)
 
 
-def _nearest(nodes: Nodes) -> dict[int, None]:
-    """The nodes nearest to the top, by breadth, as many as are shown."""
-    found = {nodes.root: None}
-    queue = [nodes.root]
+def _nearest(diagram: Diagram) -> dict[int, dict[int, list[int]]]:
+    """The nodes nearest to the top, by breadth, each with its children and the values that lead there.
+
+    Nodes are those of the manager's store, which keeps them where they are until its next operation.
+    """
+    root = diagram.node
+    found: dict[int, dict[int, list[int]]] = {root: {}}
+    queue = [root]
     for node in queue:
-        for child, _ in nodes.groups(node):
+        children = _children(diagram.manager, node)
+        for value, child in enumerate(children):
+            found[node].setdefault(child, []).append(value)
             if child not in found and len(found) < SHOWN_NODES:
-                found[child] = None
+                found[child] = {}
                 queue.append(child)
     return found
 
 
-def _levels(manager: Manager, nodes: Nodes) -> str:
-    counts: dict[int, int] = {}
-    for level, below in zip(nodes.levels, nodes.children, strict=True):
-        if below:
-            counts[level] = counts.get(level, 0) + 1
-    rows = [(short(level_name(manager, level)[0]), count_text(counts[level])) for level in sorted(counts)]
+def _children(manager: Manager, node: int) -> list[int]:
+    level = int(manager.pool[node])
+    if level == manager.leaf_level:
+        return []
+    return [int(child) for child in manager.pool[node + 2 : node + 2 + manager.sizes[level]]]
+
+
+def _leaf_text(diagram: Diagram, node: int) -> str:
+    payload = int(leaf_payloads(diagram.manager, np.array([node], dtype=np.int32))[0])
+    leaf = diagram.leaf_type.decode(payload)
+    return number_text(leaf) if isinstance(leaf, float) else short(str(leaf))
+
+
+def _levels(manager: Manager, levels: Int32Array) -> str:
+    counts = np.bincount(levels, minlength=manager.leaf_level + 1)[: manager.leaf_level]
+    tested = np.flatnonzero(counts).tolist()
+    rows = [(short(level_name(manager, level)[0]), count_text(int(counts[level]))) for level in tested]
     if len(rows) > SHOWN_LEVELS:
         rows = [*rows[:SHOWN_LEVELS], ("…", f"{len(rows) - SHOWN_LEVELS} more levels")]
     return table(["tests", "nodes"], rows)

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
+from factored_polca.diagrams import Diagram
+from factored_polca.diagrams.nodes import Int32Array
 from factored_polca.display.belief_graph import by_feature, followable, policy_graph
 from factored_polca.display.graphs import Graph
+from factored_polca.display.policy_tree import policy_tree
 from factored_polca.display.tables import drawing, heading, line, table, view
 from factored_polca.display.words import count_text, number_text, percent, plural, short
+from factored_polca.explicit.arrays import IntArray
 from factored_polca.explicit.state_policy import StatePolicy
 from factored_polca.hierarchy.policy_file import FlatPolicy
+from factored_polca.symbolic import SymbolicModel
+
+LARGEST: Final = 20_000
+"""Listed states up to which a policy of states is drawn as a tree."""
 
 
 def html(policy: FlatPolicy) -> str:
@@ -20,6 +30,7 @@ def html(policy: FlatPolicy) -> str:
     found = policy.policy
     if isinstance(found, StatePolicy):
         body = _actions(policy, found)
+        body += drawing(graph(policy)) if len(policy.flat.states) <= LARGEST else ""
     elif followable(policy.flat.pomdp):
         body = drawing(graph(policy))
     else:
@@ -28,17 +39,39 @@ def html(policy: FlatPolicy) -> str:
 
 
 def graph(policy: FlatPolicy) -> Graph:
-    """The policy from the initial belief on.
-
-    Raises:
-        TypeError: a policy of states, which has no graph.
-    """
+    """The policy from the initial belief on; of states a decision tree (of a horizon, the first step's)."""
     found = policy.policy
     if isinstance(found, StatePolicy):
-        raise TypeError("a policy of states has no graph; plan the model to see it as a decision tree")
-    return policy_graph(
-        policy.flat.pomdp, found, by_feature(policy.model.features, policy.flat.states.astype(np.int64))
-    )
+        symbolic, names = policy.flat.symbolic, [action.name for action in policy.model.actions]
+        choices = np.where(found.actions[-1] < 0, len(names), found.actions[-1])
+        diagram = listed_function(symbolic, policy.flat.states, choices, len(names))
+        return policy_tree(symbolic, diagram, names, "none, or not reached")
+    states = policy.flat.states.astype(np.int64)
+    return policy_graph(policy.flat.pomdp, found, by_feature(policy.model.features, states))
+
+
+def listed_function(symbolic: SymbolicModel, states: Int32Array, values: IntArray, other: int) -> Diagram:
+    """The diagram of a function: `values` [s] at listed states [s, feature], `other` elsewhere."""
+    manager = symbolic.manager
+    order = sorted(range(states.shape[1]), key=symbolic.now)
+    known: dict[tuple[int, bytes], Diagram] = {}
+
+    def build(rows: IntArray, place: int) -> Diagram:
+        if len(rows) == 0:
+            return manager.constant(other)
+        if place == len(order):
+            return manager.constant(int(values[rows[0]]))
+        key = (place, states[rows][:, order[place:]].tobytes() + values[rows].tobytes())
+        if key not in known:
+            feature = order[place]
+            size = len(symbolic.model.features[feature].values)
+            digits = states[rows, feature]
+            below = [build(rows[digits == v], place + 1) for v in range(size)]
+            known[key] = manager.variable(symbolic.now(feature), below)
+        return known[key]
+
+    everything = np.lexsort([states[:, feature] for feature in reversed(order)])
+    return build(everything.astype(np.int64), 0)
 
 
 def _said(policy: FlatPolicy) -> str:

@@ -4,10 +4,11 @@ A block, or any set of states that is given as a diagram, becomes the shortest o
 
     a minimal cover of it (`covers`),
     "not" and a minimal cover of its complement,
-    what sympy's `simplify_logic` makes of either, each literal "x in S" standing for a symbol.
+    what sympy's `simplify_logic` makes of either, each literal "x in S" standing for a symbol,
+    how many features have a value, where a longer condition only counts (`symmetry`).
 
-The number of literals decides.  A formula is true on exactly the states of its diagram; where none is found
-within the budget there is none.
+What is shorter to read decides.  A formula is true on exactly the states of its diagram; there may be none
+within the budget.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, Literal, TypeAlias
 
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Diagram, node_count
 from factored_polca.display.covers import Budget, Condition, Cube, TooLong, cover
-from factored_polca.display.nodes import read_nodes
+from factored_polca.display.nodes import Nodes, read_nodes
+from factored_polca.display.symmetry import count_vectors, one_value
 from factored_polca.models import Feature, Value
 from factored_polca.models.language import KEYWORDS
 from factored_polca.models.printing import name_text
@@ -29,6 +31,9 @@ from factored_polca.symbolic import SymbolicModel
 
 STEPS: Final = 3_000_000
 """Steps for all formulas of a table: a second or two."""
+
+LONG: Final = 40
+"""What is longer is looked at for whether it only counts."""
 
 MOST_SYMBOLS: Final = 7
 """Literals up to which sympy is asked; its time grows as 2^n."""
@@ -72,7 +77,23 @@ class Negation:
         return not self.part.holds(state)
 
 
-Formula: TypeAlias = Membership | Junction | Negation
+@dataclass(frozen=True)
+class Counting:
+    """The condition that of some features between `low` and `high` have a value, for each of some values.
+
+    `bounds` maps numbers of values to (low, high).
+    """
+
+    features: tuple[Feature, ...]
+    bounds: tuple[tuple[int, tuple[int, int]], ...]
+
+    def holds(self, state: Mapping[str, Value]) -> bool:
+        """Whether it holds at a state."""
+        numbers = [feature.index(state[feature.name]) for feature in self.features]
+        return all(low <= numbers.count(value) <= high for value, (low, high) in self.bounds)
+
+
+Formula: TypeAlias = Membership | Junction | Negation | Counting
 
 TRUE: Final = Junction("and", ())
 FALSE: Final = Junction("or", ())
@@ -84,12 +105,12 @@ def formula(symbolic: SymbolicModel, condition: Diagram, budget: Budget | None =
     Raises:
         ValueError: the diagram tests something other than present features.
     """
+    if node_count(condition) > LARGEST_DIAGRAM:
+        return None
     nodes = read_nodes(condition)
     features = {symbolic.now(k): feature for k, feature in enumerate(symbolic.model.features)}
     if not set(nodes.support) <= set(features):
         raise ValueError("a formula is made of a condition over present features")
-    if len(nodes.levels) > LARGEST_DIAGRAM:
-        return None
     budget = Budget(STEPS) if budget is None else budget
     tested = [features[level] for level in nodes.support]
     sizes = [len(feature.values) for feature in tested]
@@ -104,7 +125,35 @@ def formula(symbolic: SymbolicModel, condition: Diagram, budget: Budget | None =
                 candidates += [found] if true else [negated(found), inverted(found)]
         if true and len(cubes) <= 1:  # its opposite is no shorter
             break
+    if not candidates or min(map(size, candidates)) > LONG:
+        counted = _counting(nodes, tested, budget)
+        if counted is not None:
+            return counted
     return min(candidates, key=size, default=None)
+
+
+def _counting(nodes: Nodes, tested: Sequence[Feature], budget: Budget) -> Formula | None:
+    """A condition that only counts, where one value or one vector says it all."""
+    if len({feature.values for feature in tested}) != 1:
+        return None
+    n, d = len(tested), len(tested[0].values)
+    try:
+        vectors = count_vectors(nodes, [d] * n, budget)
+    except TooLong:
+        return None
+    if not vectors:
+        return None
+    single = one_value(vectors, n, d)
+    if single is not None:
+        value, low, high = single
+        return Counting(tuple(tested), ((value, (low, high)),))
+    if len(vectors) > 1:
+        return None
+    (counts,) = vectors
+    bounds = [(value, (many, many)) for value, many in enumerate(counts) if many]
+    if len(bounds) == len(counts):  # the last follows from the others
+        bounds.remove(max(bounds, key=lambda bound: bound[1]))
+    return Counting(tuple(tested), tuple(bounds))
 
 
 def size(found: Formula) -> int:
@@ -114,6 +163,8 @@ def size(found: Formula) -> int:
             return 5 if 2 * len(found.values) > len(found.feature.values) else 4
         case Negation():
             return size(found.part) + 2
+        case Counting():
+            return 6 * len(found.bounds)
         case Junction():
             return sum(size(part) for part in found.parts)
 
@@ -124,7 +175,9 @@ def negated(found: Formula) -> Formula:
         return Membership(found.feature, frozenset(range(len(found.feature.values))) - found.values)
     if isinstance(found, Negation):
         return found.part
-    return Junction("or" if found.operator == "and" else "and", ()) if not found.parts else Negation(found)
+    if isinstance(found, Junction) and not found.parts:
+        return TRUE if found.operator == "or" else FALSE
+    return Negation(found)
 
 
 def inverted(found: Formula) -> Formula:
@@ -204,10 +257,28 @@ def text(found: Formula, names: frozenset[str] = frozenset()) -> str:
             return _test_text(found, names)
         case Negation():
             return f"not ({text(found.part, names)})"
+        case Counting():
+            return _counting_text(found, names)
         case Junction():
             if not found.parts:
                 return "true" if found.operator == "and" else "false"
             return f" {found.operator} ".join(_part_text(found, part, names) for part in found.parts)
+
+
+def _counting_text(found: Counting, names: frozenset[str]) -> str:
+    """`exactly 3 of x_0 .. x_9 == on`: in words, as the language of model files can't count."""
+    ends = f"{name_text(found.features[0].name)} .. {name_text(found.features[-1].name)}"
+    said = []
+    for value, (low, high) in found.bounds:
+        what, n = _value_text(found.features[0].values[value], names), len(found.features)
+        if low == high:
+            many = {0: "none", n: f"all {n}"}.get(low, f"exactly {low}")
+        elif low == 0:
+            many = f"at most {high}"
+        else:
+            many = f"at least {low}" if high == n else f"{low} to {high}"
+        said.append(f"{many} of {ends} == {what}")
+    return " and ".join(said)
 
 
 def _part_text(whole: Junction, part: Formula, names: frozenset[str]) -> str:

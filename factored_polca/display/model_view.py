@@ -13,7 +13,7 @@ from typing import Final
 from factored_polca.display.graphs import Edge, Graph, Node, Stroke
 from factored_polca.display.tables import drawing, heading, line, table, view
 from factored_polca.display.words import count_text, listed, plural, short, value_text, values_text
-from factored_polca.models import Action, Model
+from factored_polca.models import Action, Feature, Model
 from factored_polca.models.expressions import Constant, Expression, Lottery, Reference, references
 from factored_polca.models.printing import number_text
 
@@ -55,10 +55,11 @@ def graph(model: Model, actions: Iterable[str] | None = None) -> Graph:
     shown = [f.name for f in model.features[:SHOWN_FEATURES]]
     arcs = _Arcs(shown)
     for action in chosen:
-        _add_action(arcs, model, action)
+        _add_action(arcs, model.features[:SHOWN_FEATURES], action)
+    arcs.parents(model.rewards, "reward", "every action")
     channels = [o.name for o in model.observations[:SHOWN_FEATURES]]
     nodes = [Node(f"now {name}", (short(name),), "feature", name, heading=False) for name in shown]
-    changed = {target for _, target in arcs.found}
+    changed = {target for _, target in arcs.actions}
     nodes += [
         Node(f"next {name}", (f"{short(name)}′",), "next", f"{name} in the next state", False, rank=1)
         for name in shown
@@ -71,7 +72,7 @@ def graph(model: Model, actions: Iterable[str] | None = None) -> Graph:
     if "reward" in changed:
         nodes.append(Node("reward", ("reward",), "reward", "the reward of a step", False, rank=1))
     known = {node.key for node in nodes}
-    edges = [arcs.edge(*pair) for pair in arcs.found if pair[0] in known and pair[1] in known]
+    edges = [arcs.edge(*pair) for pair in arcs.actions if pair[0] in known and pair[1] in known]
     names = "all actions together" if actions is None else listed([a.name for a in chosen])
     left = len(model.features) - len(shown)
     note = (
@@ -85,15 +86,17 @@ def graph(model: Model, actions: Iterable[str] | None = None) -> Graph:
 
 
 class _Arcs:
-    """Arcs as they are found, each with the actions that have it."""
+    """Arcs as they are found, each with the actions that have it and whether it only says that x stays."""
 
     def __init__(self, shown: Sequence[str]) -> None:
         self.shown = set(shown)
-        self.found: dict[tuple[str, str], tuple[list[str], bool]] = {}
+        self.actions: dict[tuple[str, str], dict[str, None]] = {}
+        self.changing: set[tuple[str, str]] = set()
 
     def add(self, source: str, target: str, action: str, persists: bool = False) -> None:
-        actions, only_persists = self.found.get((source, target), ([], True))
-        self.found[source, target] = ([*actions, action], only_persists and persists)
+        self.actions.setdefault((source, target), {})[action] = None
+        if not persists:
+            self.changing.add((source, target))
 
     def parents(self, expressions: Iterable[Expression], target: str, action: str) -> None:
         for reference in sorted(references(*expressions), key=lambda r: (r.primed, r.name)):
@@ -101,17 +104,15 @@ class _Arcs:
                 self.add(f"{'next' if reference.primed else 'now'} {reference.name}", target, action)
 
     def edge(self, source: str, target: str) -> Edge:
-        actions, persists = self.found[source, target]
-        stroke: Stroke = "dashed" if persists else "solid"
+        actions, persists = self.actions[source, target], (source, target) not in self.changing
+        stroke: Stroke = "dashed" if persists else "faint" if target == "reward" else "solid"
         kept = "stays as it is under " if persists else "under "
-        return Edge(source, target, "", stroke, kept + listed(dict.fromkeys(actions), 8))
+        return Edge(source, target, "", stroke, kept + listed(actions, 8))
 
 
-def _add_action(arcs: _Arcs, model: Model, action: Action) -> None:
+def _add_action(arcs: _Arcs, features: Sequence[Feature], action: Action) -> None:
     effects = dict(action.effects)
-    for feature in model.features:
-        if feature.name not in arcs.shown:
-            continue
+    for feature in features:
         effect = effects.get(feature.name)
         if effect is None or effect == Reference(feature.name):
             arcs.add(f"now {feature.name}", f"next {feature.name}", action.name, persists=True)
@@ -119,7 +120,7 @@ def _add_action(arcs: _Arcs, model: Model, action: Action) -> None:
             arcs.parents([effect], f"next {feature.name}", action.name)
     for name, sensed in action.senses:
         arcs.parents([sensed], f"sees {name}", action.name)
-    arcs.parents([*model.rewards, *action.rewards], "reward", action.name)
+    arcs.parents(action.rewards, "reward", action.name)
 
 
 def _features(model: Model) -> str:

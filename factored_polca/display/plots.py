@@ -99,10 +99,9 @@ def fitted_exponent(sizes: Sequence[float], values: Sequence[float]) -> tuple[fl
     Raises:
         ValueError: fewer than two different sizes, or numbers that are not positive.
     """
-    n, y = np.asarray(sizes, dtype=float), np.asarray(values, dtype=float)
-    if len(n) != len(y) or len(set(n.tolist())) < 2 or (n <= 0).any() or (y <= 0).any():
+    if len(sizes) != len(values) or len(set(sizes)) < 2 or min(*sizes, *values) <= 0:
         raise ValueError("a power law is fitted to positive values at two different sizes at least")
-    slope, constant = np.polyfit(np.log(n), np.log(y), 1)
+    slope, constant = np.polyfit([math.log(n) for n in sizes], [math.log(y) for y in values], 1)
     return float(slope), float(math.exp(constant))
 
 

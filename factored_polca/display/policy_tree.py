@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from factored_polca.diagrams import Diagram, cofactors
+from factored_polca.diagrams import Diagram, cofactors, node_count
 from factored_polca.display.diagram_view import arc_text
 from factored_polca.display.graphs import Edge, Graph, Kind, Node
 from factored_polca.display.nodes import Nodes, read_nodes
@@ -37,13 +37,27 @@ LARGEST: Final = 20_000
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the tree: its function, the share of all states that lead there, and the level tested."""
+    """A part of the tree: its function, the share of all states that lead there, and the level tested.
+
+    `nodes` is None where the function's diagram is too large.
+    """
 
     key: str
     function: Diagram
     share: Fraction
-    nodes: Nodes
+    nodes: Nodes | None
     level: int | None = None
+
+    @property
+    def leaf(self) -> int | None:
+        """The choice, where there is only one."""
+        return int(self.function.value) if self.function.is_constant else None
+
+
+def made(key: str, function: Diagram, share: Fraction) -> Part:
+    """A part that is not unfolded."""
+    small = node_count(function) <= LARGEST
+    return Part(key, function, share, read_nodes(function) if small else None)
 
 
 def policy_tree(
@@ -56,9 +70,8 @@ def policy_tree(
     drawn, cut = [], 0
     for part in parts:
         count = plural(int(part.share * states), "state")
-        leaf = part.nodes.leaves[part.nodes.root]
-        if leaf is not None:
-            chosen = min(int(leaf), len(choices))
+        if part.leaf is not None:
+            chosen = min(part.leaf, len(choices))
             kind: Kind = "action" if chosen < len(choices) else "terminal"
             name = names[chosen]
             drawn.append(
@@ -84,14 +97,16 @@ def policy_tree(
 def _unfolded(symbolic: SymbolicModel, policy: Diagram, count: int) -> tuple[list[Part], list[Edge]]:
     """The parts that are shown and the arcs between them, the parts with the most states unfolded first."""
     features = {symbolic.now(k): feature for k, feature in enumerate(symbolic.model.features)}
-    parts, edges = [Part("0", policy, Fraction(1), read_nodes(policy))], list[Edge]()
+    parts, edges = [made("0", policy, Fraction(1))], list[Edge]()
     heap = [(-parts[0].share, 0)]
     while heap:
         _, number = heapq.heappop(heap)
         part = parts[number]
-        if part.nodes.leaves[part.nodes.root] is not None:
+        if part.leaf is not None:
             continue
-        level = _best_level(part.nodes, {n: len(f.values) for n, f in features.items()}, count)
+        level = part.function.level
+        if part.nodes is not None:
+            level = _best_level(part.nodes, {n: len(f.values) for n, f in features.items()}, count)
         groups: list[tuple[Diagram, list[int]]] = []
         for value, function in enumerate(cofactors(part.function, level)):
             same = next((some for other, some in groups if other == function), None)
@@ -104,10 +119,10 @@ def _unfolded(symbolic: SymbolicModel, policy: Diagram, count: int) -> tuple[lis
         parts[number], values = replace(part, level=level), features[level].values
         for function, some in groups:
             share = part.share * Fraction(len(some), len(values))
-            made = Part(str(len(parts)), function, share, read_nodes(function))
-            edges.append(Edge(part.key, made.key, arc_text(values, tuple(some))))
+            below = made(str(len(parts)), function, share)
+            edges.append(Edge(part.key, below.key, arc_text(values, tuple(some))))
             heapq.heappush(heap, (-share, len(parts)))
-            parts.append(made)
+            parts.append(below)
     return parts, edges
 
 
@@ -126,7 +141,7 @@ def shares(nodes: Nodes, count: int) -> FloatArray:
 def _best_level(nodes: Nodes, sizes: dict[int, int], count: int) -> int:
     """The level with the highest gain ratio, the top one of equals."""
     support = nodes.support
-    if len(nodes.levels) > LARGEST or len(support) == 1:
+    if len(support) == 1:
         return support[0]
     below = shares(nodes, count)
     reach = np.zeros(len(nodes.levels))
@@ -165,8 +180,8 @@ def _entropy(weights: FloatArray) -> float:
     return float(-(q * np.log2(q)).sum())
 
 
-def _mixture(nodes: Nodes, names: Sequence[str]) -> tuple[str, ...]:
-    if len(nodes.levels) > LARGEST:
+def _mixture(nodes: Nodes | None, names: Sequence[str]) -> tuple[str, ...]:
+    if nodes is None:
         return ("…",)
     found = shares(nodes, len(names) - 1)[nodes.root]
     used = [k for k in np.argsort(-found, kind="stable").tolist() if found[k] > 0]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factored_polca.display.charts import Series, line_chart
-from factored_polca.display.pictures import BLUE, RED
+from factored_polca.display.charts import BLUE, RED, Series, line_chart
 from factored_polca.display.tables import heading, line, pairs, scrolled, view
 from factored_polca.display.words import count_text, number_text, plural, seconds_text
 from factored_polca.explicit.entropy_policy import EntropyPolicy

@@ -43,6 +43,7 @@ from factored_polca.simulation.belief_runs import (
     whole_model,
 )
 from factored_polca.simulation.listed_policy import ListedActions, ListedMinds
+from factored_polca.simulation.runnable import AnyPlan, runnable
 from factored_polca.simulation.simulate import StateActions, default_steps, simulate, simulate_actions
 
 TIE: Final = 1e-9
@@ -50,7 +51,7 @@ EPISODES: Final = 1000
 FEW_EPISODES: Final = 100
 """Episodes where nobody asks for another number and beliefs are tracked one by one."""
 
-AnyPlan: TypeAlias = ExecutablePlan | ExecutablePomdpPlan | FlatPolicy
+Runnable: TypeAlias = ExecutablePlan | ExecutablePomdpPlan | FlatPolicy
 
 
 @dataclass(frozen=True)
@@ -171,19 +172,21 @@ def compare(
 
     Raises:
         ModelError: they are of different models, or for different numbers of steps.
+        TypeError: no plan and no policy.
         ValueError: fewer than one episode or step, or a level that is no probability.
     """
     if (episodes is not None and episodes < 1) or (steps is not None and steps < 1):
         raise ValueError("episodes and steps must be at least 1")
     if not 0 < level < 1:
         raise ValueError(f"the level is {level}; it is a probability between 0 and 1, such as 0.95")
-    reason = model_difference(first.model, second.model)
+    plans = runnable(first), runnable(second)
+    reason = model_difference(plans[0].model, plans[1].model)
     if reason is not None:
         raise ModelError(
             f"the plans are of different models: {reason}; only plans of one model are compared"
         )
-    length = common_steps(first, second, steps)
-    runners = [runner_of(plan, seed) for plan in (first, second)]
+    length = common_steps(*plans, steps)
+    runners = [runner_of(plan, seed) for plan in plans]
     count = episodes or (FEW_EPISODES if any(one.slow for one in runners) else EPISODES)
     chunk = max(1, min(count, *(one.at_once for one in runners)))
     found: list[list[Outcome]] = [[], []]
@@ -205,7 +208,7 @@ def chunk_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0])
 
 
-def common_steps(first: AnyPlan, second: AnyPlan, steps: int | None) -> int:
+def common_steps(first: Runnable, second: Runnable, steps: int | None) -> int:
     """The steps of an episode: those asked for, a policy's horizon, or as many as the discount needs.
 
     Raises:
@@ -227,7 +230,7 @@ def common_steps(first: AnyPlan, second: AnyPlan, steps: int | None) -> int:
 # -- how each kind of plan is run ----------------------------------------------------------------------
 
 
-def runner_of(plan: AnyPlan, seed: int) -> Runner:
+def runner_of(plan: Runnable, seed: int) -> Runner:
     """How a plan is run."""
     if plan.model.observability == "full":
         return _seen(plan)
@@ -236,7 +239,7 @@ def runner_of(plan: AnyPlan, seed: int) -> Runner:
     return _tracked(plan, seed)
 
 
-def _seen(plan: AnyPlan) -> Runner:
+def _seen(plan: Runnable) -> Runner:
     if isinstance(plan, ExecutablePlan):
         return Runner(partial(_run_plan, plan), BELIEF_NUMBERS)
     if isinstance(plan, FlatPolicy):

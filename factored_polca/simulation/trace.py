@@ -22,8 +22,10 @@ from factored_polca.diagrams import support
 from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.arrays import FloatArray
 from factored_polca.hierarchy.executable import ExecutablePlan
+from factored_polca.hierarchy.policy_file import FlatPolicy
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
 from factored_polca.models import Model, Value
+from factored_polca.simulation.runnable import AnyPlan, runnable
 from factored_polca.simulation.sampler import Sampler, States
 
 Plan: TypeAlias = ExecutablePlan | ExecutablePomdpPlan
@@ -78,12 +80,16 @@ class Trace(Drawn, Framed):
         return np.array([*(step.beliefs[feature] for step in self.steps), self.beliefs[feature]])
 
 
-def trace(plan: Plan, *, steps: int = STEPS, seed: int = 0) -> Trace:
+def trace(plan: AnyPlan, *, steps: int = STEPS, seed: int = 0) -> Trace:
     """Run one episode of a plan, of at most so many steps.
 
     Raises:
         ValueError: fewer than one step.
+        TypeError: no plan; policies without a hierarchy have no trace.
     """
+    plan = runnable(plan)
+    if isinstance(plan, FlatPolicy):
+        raise TypeError("a policy without a hierarchy has no trace; `plan` without tasks makes a flat plan")
     if steps < 1:
         raise ValueError(f"{steps} steps; a trace has at least 1")
     if plan.model.observability == "full":
