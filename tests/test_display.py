@@ -322,3 +322,13 @@ def test_the_texts_for_graphviz_and_mermaid_come_from_the_objects(taxi: fp.Hiera
     assert taxi.to_mermaid().startswith("flowchart")
     assert taxi.model.to_svg().startswith("<svg xmlns=")
     assert 'label="Root\\n55 blocks' in taxi.to_dot()
+
+
+def test_interchangeable_actions_are_said_to_be_so() -> None:
+    model = fp.load_domain("sysadmin", {"size": 4}).model
+    found = fp.plan(model, None, fp.Options(interchangeable=True))
+    assert isinstance(found, fp.HierarchicalPlan)
+    assert "actions count by what they do" in shown(found.root.reduction).text
+    choices = {node.lines[0] for node in display.graph(found.root).nodes if node.kind == "action"}
+    assert choices <= {action.name for action in model.actions}
+    assert any(choice.startswith("reboot") for choice in choices)

@@ -18,6 +18,7 @@ from factored_polca.cli.argument_types import (
     size,
     solver,
 )
+from factored_polca.cli.bench_arguments import add_bench
 from factored_polca.cli.compare_arguments import add_comparing
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
@@ -129,6 +130,10 @@ def parser() -> argparse.ArgumentParser:
         "--flat-blocks", type=natural, default=100_000, metavar="N",
         help="leave out the flat optimum beyond N blocks (100000)",
     )  # fmt: skip
+    sub.add_argument(
+        "--interchangeable", action="store_true",
+        help="actions count by what they do, not by name (where the state is seen)",
+    )  # fmt: skip
     group = sub.add_argument_group("where the state is not seen")
     group.add_argument(
         "--gap", type=gap, metavar="G",
@@ -177,6 +182,7 @@ def parser() -> argparse.ArgumentParser:
     add_comparing(
         command("compare", "Compare two plans, or policies, of one model on the same random numbers.")
     )
+    add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
     add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)

@@ -255,9 +255,9 @@ class Manager:
         self.slots[:] = 0
         self.ring_state[0] = 0
         stack = np.empty(2 * self.leaf_level + 4, np.int32)
-        self._made = self.nodes_made
+        made = self.nodes_made
         compact(self.pool, self.head, self.unique, self.arity, self.roots, stack)
-        self._counted = int(self.head[1])
+        self._made, self._counted = made, int(self.head[1])
         self._live = int(self.head[0])
         self._plan_collection()
 

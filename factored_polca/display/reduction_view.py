@@ -7,12 +7,18 @@ from factored_polca.display.graphs import Graph
 from factored_polca.display.tables import line, view
 from factored_polca.display.words import plural, seconds_text
 from factored_polca.minimisation import Minimisation, Reduction
+from factored_polca.minimisation.reduction import InterchangeableReduction
 
 
 def html(found: Minimisation | Reduction) -> str:
     """What was found, and how."""
     if isinstance(found, Reduction):
-        return view(quotient_view.html(found.quotient), line(_trust(found.minimisation)))
+        exchanged = ""
+        if isinstance(found, InterchangeableReduction):
+            exchanged = (
+                "actions count by what they do; shown are the named ones of each block's first state"
+            )
+        return view(quotient_view.html(found.quotient), line(exchanged), line(_trust(found.minimisation)))
     return view(partition_view.html(found.partition), line(_trust(found)))
 
 
