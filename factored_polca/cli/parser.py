@@ -19,6 +19,7 @@ from factored_polca.cli.argument_types import (
     solver,
 )
 from factored_polca.cli.bench_arguments import add_bench
+from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
 hierarchies: each subtask is minimised exactly on decision diagrams, without enumerating states, and
@@ -180,6 +181,9 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
     add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
     add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, 4c, table1."))
+    add_study(
+        command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
+    )
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
