@@ -43,7 +43,7 @@ UInt64Array = npt.NDArray[np.uint64]
 
 UNLIMITED = 2**62
 
-LARGE = 1000
+LARGE = 200
 """Nodes of V from which on it matters how it is regressed."""
 
 

@@ -1,7 +1,8 @@
 """Which way to regress a large V: from the bottom up or from the top down, found by running both in turns.
 
-Each gets slices of about equal time, twice as many in each turn, so that no more than some three times the
-quicker one's time is spent; the winner of one pass is taken without a race in the next.
+The way down begins with a short try.  Then each gets slices of about equal time, twice as many in each
+turn, so that no more than some three times the quicker one's time is spent.  The winner of one pass is
+taken without a race in the next.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ Way = Literal["up", "down"]
 
 ENTRIES_PER_STEP = 8
 """Entries of vectors that take the time of one step of a weighted sum, as measured."""
+
+
+SHORT_TRY = 64
+"""Entries for each node of V that the way down may take before there is a race."""
 
 
 class Race:
@@ -39,12 +44,20 @@ class Race:
             return None
         manager = numbers.manager
         manager.safe_point()
-        down: ForwardRegression | None = None
+        start = ForwardRegression(numbers, primitive, value)
+        down: ForwardRegression | None = start
         up: NodeRegression | None = None
+        failure: MemoryLimit | None = None
         if way != "down":
+            try:
+                found = start.run(SHORT_TRY * start.nodes)
+            except MemoryLimit as error:
+                down, failure, found = None, error, None
+            if found is not None:
+                self.ways[primitive] = "down"
+                return found
             up = NodeRegression(numbers, numbers.prepared(primitive), value)
         slices = 1
-        failure: MemoryLimit | None = None
         while True:
             if up is not None:
                 try:
@@ -53,19 +66,18 @@ class Race:
                         return up.result
                 except MemoryLimit as error:
                     up, failure = None, error
-            if failure is None or up is None:
-                if down is None:
-                    down = ForwardRegression(numbers, primitive, value)
+            if down is not None:
                 try:
                     found = down.run(slices * STEPS * ENTRIES_PER_STEP)
                 except MemoryLimit as error:
-                    if up is None:
-                        raise
                     down, failure = None, error
                 else:
                     if found is not None:
                         self.ways[primitive] = "down"
                         return found
+            if up is None and down is None:
+                assert failure is not None
+                raise failure
             manager.pause()
             slices *= 2
 

@@ -54,11 +54,13 @@ from factored_polca.diagrams import (
     Field,
     MemoryLimit,
     choose,
+    node_count,
     pairs,
     random_prime,
     relabel,
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.minimisation.criterion import (
     DecisionProcess,
     ProcessView,
@@ -69,7 +71,7 @@ from factored_polca.minimisation.criterion import (
 )
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
-from factored_polca.minimisation.propagation import UNLIMITED, Propagation, TooManyBlocks
+from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagation, TooManyBlocks
 from factored_polca.minimisation.race import Race
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
@@ -84,7 +86,7 @@ EARLY = 3
 
 
 @dataclass(frozen=True)
-class Minimisation:
+class Minimisation(Drawn, Framed):
     """A partition and how it was found.
 
     `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the
@@ -290,7 +292,13 @@ class _Refinement:
             return self.propagate(1)
         before = self.labels.blocks
         value = relabel(self.labels.diagram, self.labels.elements, self.field)
-        self.split(self.polynomial.of_rows(value, {}))
+        memo: dict[int, Diagram] = {}
+        if node_count(value) >= LARGE:
+            for primitive in {p for choice in self.process.choices for p in choice.primitives}:
+                result = self.race.regress(self.view.numbers, primitive, value)
+                if result is not None:
+                    memo[primitive] = result
+        self.split(self.polynomial.of_rows(value, memo))
         self.rounds += 1
         self.report(self.rounds, self.labels.blocks)
         return self.labels.blocks > before

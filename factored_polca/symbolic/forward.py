@@ -97,6 +97,11 @@ class ForwardRegression:
         self.met = np.zeros(len(nodes), dtype=np.int32)
 
     @property
+    def nodes(self) -> int:
+        """The nodes of V."""
+        return len(self.node_level)
+
+    @property
     def items(self) -> int:
         """The items of the level under way."""
         return len(self.first) - 1

@@ -39,6 +39,7 @@ from factored_polca.models.expressions import ZERO, Expression, Reference, refer
 from factored_polca.models.scalars import Undefined, describe
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, Variable, row_of, used
 from factored_polca.symbolic.initial import compile_initial
+from factored_polca.symbolic.names import LevelNames
 from factored_polca.symbolic.observations import (
     compile_observations,
     expect_observations,
@@ -166,6 +167,7 @@ def compile_model(
     sizes += [len(channel.values) for channel in model.observations]
     manager = Manager(sizes, memory_limit=memory_limit)
     manager.deadline = deadline
+    manager.describe = LevelNames(model, names).describe
     levels = {
         Reference(name, primed): 2 * position[index] + primed
         for name, index in features.items()
@@ -224,6 +226,7 @@ class _Build:
         self.faults: list[Fault] = []
         self.suspects: list[tuple[Variable, Diagram, Diagram, tuple[str, ...]]] = []
         self.known_rows: dict[tuple[tuple[object, ...], Expression], RowDiagram] = {}
+        self.known_terms: dict[Expression, Term] = {}
         self.false, self.true = manager.constant(0), manager.constant(1)
 
     @classmethod
@@ -267,11 +270,8 @@ class _Build:
         self.faults.append(Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}"))
 
     def level_text(self, level: int, value: int) -> str:
-        if level >= 2 * len(self.order):
-            channel = self.model.observations[level - 2 * len(self.order)]
-            return f"{channel.name}={_show(channel.values[value])}"
-        feature = self.model.feature(self.order[level // 2])
-        return f"{feature.name}{chr(39) if level % 2 else ''}={_show(feature.values[value])}"
+        name, values = LevelNames(self.model, self.order).describe(level)
+        return f"{name}={_show(values[value])}"
 
     # -- actions ---------------------------------------------------------------------------
 
@@ -397,10 +397,18 @@ class _Build:
         observations: dict[int, RowDiagram],
     ) -> Term:
         """A reward term as a function of (x, x'), o in expectation; a condition counts as 0 or 1."""
+        if expression in self.known_terms:  # of another action, with no fault anywhere
+            return expect_observations(self, self.known_terms[expression], observations)
         compiled = self.compiler.compile(expression)
-        bad = np.array(
-            [not isinstance(v, (Fraction, bool)) for v in self.compiler.table.values], dtype=np.uint64
-        )
+        entries = used(compiled)
+        values = [self.compiler.value(entry) for entry in entries]
+        if all(isinstance(value, (Fraction, bool)) for value in values):
+            term = numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+            self.known_terms[expression] = term
+            return expect_observations(self, term, observations)
+        bad = np.zeros(max(entries) + 1, dtype=np.uint64)
+        for entry, value in zip(entries, values, strict=True):
+            bad[entry] = not isinstance(value, (Fraction, bool))
         wrong = restrict_to_possible(self, relabel(compiled, bad, INDEX) & where, observations)
         wrong = self.happening(wrong, rows)
         if wrong != self.false:
@@ -410,10 +418,14 @@ class _Build:
 
     def expected(self, term: Term, rows: dict[int, RowDiagram], elimination: tuple[int, ...]) -> Term:
         """The expectation over x' of a term."""
+        tested = set(support(term.diagram))
+        if not any(level % 2 for level in tested if level < 2 * len(self.order)):
+            return term
         for index in elimination:
             level = 2 * self.positions[index] + 1
-            if level in support(term.diagram):
+            if level in tested:
                 term = self.expectation(term, index, level, rows.get(index))
+                tested = set(support(term.diagram))
         return term
 
     def expectation(self, term: Term, index: int, level: int, row: RowDiagram | None) -> Term:

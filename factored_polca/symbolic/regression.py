@@ -36,6 +36,9 @@ from factored_polca.diagrams.weighted import run_regression
 from factored_polca.symbolic.model import SymbolicModel
 from factored_polca.symbolic.rows import Term
 
+SHARED_SUM = 128
+"""Terms up to which a sum's parts are kept: some n^3 / 6 nodes for n terms over a feature each."""
+
 
 @dataclass
 class Prepared:
@@ -63,6 +66,8 @@ class NumericView:
         self.zero = self.manager.constant(0, leaf_type)
         self.one = self.manager.constant(1, leaf_type)
         self._weights: dict[tuple[int, int], list[Diagram]] = {}
+        self._terms: dict[int, tuple[Term, Diagram]] = {}
+        self._sums: dict[tuple[int, int], tuple[Diagram, Diagram, Diagram]] = {}
         self._prepared: dict[int, Prepared] = {}
         self._options: tuple[int, npt.NDArray[np.int64]] | None = None
 
@@ -74,7 +79,24 @@ class NumericView:
 
     def term(self, term: Term) -> Diagram:
         """A term with its values as leaves."""
-        return relabel(term.diagram, self.stored(term.values), self.leaf_type)
+        key = id(term.diagram)  # actions share terms
+        if key not in self._terms:
+            self._terms[key] = (term, relabel(term.diagram, self.stored(term.values), self.leaf_type))
+        return self._terms[key][1]
+
+    def total(self, terms: Sequence[Term]) -> Diagram:
+        """The sum of some terms; short sums that begin alike share what they begin with."""
+        total = self.zero
+        for term in terms:
+            part = self.term(term)
+            if len(terms) > SHARED_SUM:
+                total = total + part
+                continue
+            path = (id(total), id(part))
+            if path not in self._sums:
+                self._sums[path] = (total, part, total + part)
+            total = self._sums[path][2]
+        return total
 
     def weights(self, action: int, feature: int) -> list[Diagram]:
         """P_a(x_i' = v | parents) for each v."""
