@@ -105,11 +105,43 @@ def dyadic(model: Any, denominator: int) -> Any:
     return replace_fields(model, actions=actions)
 
 
+def begun(model: Any) -> Any:
+    """The model from one state, where an action `begin` draws what the initial belief leaves open.
+
+    Storm lists the states of an `init` with an SMT solver, one by one.
+    """
+    from factored_polca.models import FALSE, TRUE, Action, boolean, conjunction, lottery, operation
+    from factored_polca.models.expressions import Constant, Lottery
+    from factored_polca.models.model import InitialBelief, replace_fields
+    from factored_polca.models.scalars import scalar
+
+    first, drawn = dict(model.initial.distributions), {}
+    for feature in model.features:
+        values = [Constant(scalar(value)) for value in feature.values]
+        given = first.get(feature.name, lottery([(v, Fraction(1, len(values))) for v in values]))
+        if isinstance(given, Lottery) and len(given.outcomes) > 1:
+            drawn[feature.name] = given
+            given = given.outcomes[0][0]
+        first[feature.name] = given
+    if not drawn:
+        return replace_fields(model, initial=InitialBelief(first))
+    started = boolean("started")
+    actions = [
+        Action(a.name, a.effects, applicable=conjunction([started.now, a.applicable]), rewards=a.rewards)
+        for a in model.actions
+    ]
+    begin = Action("begin", {**drawn, started: TRUE}, applicable=operation("not", started.now))
+    return replace_fields(
+        model, features=(*model.features, started), actions=(begin, *actions),
+        initial=InitialBelief({**first, started.name: FALSE}),
+    )  # fmt: skip
+
+
 def model_of(case: Case) -> Any:
     """The model of a case."""
     from factored_polca import library
 
-    return dyadic(library.load(case.domain, case.settings).model, case.denominator)
+    return dyadic(begun(library.load(case.domain, case.settings).model), case.denominator)
 
 
 def run_ours(case: Case) -> dict[str, Any]:
