@@ -108,7 +108,8 @@ def dyadic(model: Any, denominator: int) -> Any:
 def begun(model: Any) -> Any:
     """The model from one state, where an action `begin` draws what the initial belief leaves open.
 
-    Storm lists the states of an `init` with an SMT solver, one by one.
+    Storm lists the states of an `init` with an SMT solver, one by one, which would take most of its time; so
+    it gets this model, one state larger, and we the original, to which `begin` is no help.
     """
     from factored_polca.models import FALSE, TRUE, Action, boolean, conjunction, lottery, operation
     from factored_polca.models.expressions import Constant, Lottery
@@ -137,11 +138,12 @@ def begun(model: Any) -> Any:
     )  # fmt: skip
 
 
-def model_of(case: Case) -> Any:
+def model_of(case: Case, *, from_one_state: bool) -> Any:
     """The model of a case."""
     from factored_polca import library
 
-    return dyadic(begun(library.load(case.domain, case.settings).model), case.denominator)
+    model = library.load(case.domain, case.settings).model
+    return dyadic(begun(model) if from_one_state else model, case.denominator)
 
 
 def run_ours(case: Case) -> dict[str, Any]:
@@ -150,7 +152,7 @@ def run_ours(case: Case) -> dict[str, Any]:
     from factored_polca.minimisation import flat_process, minimise
     from factored_polca.symbolic import compile_model
 
-    model = model_of(case)
+    model = model_of(case, from_one_state=False)
     warm_up()
     began = time.process_time()
     symbolic = compile_model(model)
@@ -272,7 +274,9 @@ def main() -> None:
         from factored_polca.formats.prism_writer import write_prism
 
         number, path = arguments.write
-        Path(path).write_text(write_prism(model_of(CASES[int(number)])), encoding="utf-8")
+        Path(path).write_text(
+            write_prism(model_of(CASES[int(number)], from_one_state=True)), encoding="utf-8"
+        )
         return
     if arguments.ours is None and not arguments.storm:
         table(arguments)
