@@ -108,8 +108,8 @@ def dyadic(model: Any, denominator: int) -> Any:
 def begun(model: Any) -> Any:
     """The model from one state, where an action `begin` draws what the initial belief leaves open.
 
-    Storm lists the states of an `init` with an SMT solver, one by one, which would take most of its time; so
-    it gets this model, one state larger, and we the original, to which `begin` is no help.
+    Storm lists the states of an `init` with an SMT solver, one by one, which would take most of its time;
+    so it gets this model, one state larger, and we the original, to which `begin` is no help.
     """
     from factored_polca.models import FALSE, TRUE, Action, boolean, conjunction, lottery, operation
     from factored_polca.models.expressions import Constant, Lottery
