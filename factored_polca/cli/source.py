@@ -12,6 +12,7 @@ from pathlib import Path
 
 from factored_polca import library
 from factored_polca.formats import FORMATS, read
+from factored_polca.formats.files import parts
 from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, Value
 
 
@@ -52,7 +53,8 @@ def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> S
     locate: Callable[[Iterable[Fault]], tuple[Fault, ...]] = tuple
     if path.is_file() or path.suffix.lower() in FORMATS or path.is_dir():
         document = read(path, parameters)
-        name, model, hierarchy, warnings = path.name, document.model, document.tasks, document.warnings
+        name = "+".join(part.name for part in parts(text))
+        model, hierarchy, warnings = document.model, document.tasks, document.warnings
         locate = document.locate
     elif text in library.domains():
         domain = library.load(text, parameters)
