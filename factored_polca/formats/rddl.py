@@ -66,13 +66,15 @@ def read_rddl_with_warnings(
     Raises:
         ModelError: the texts are not right, hold what is not read or ask for too much; no pyRDDLGym.
     """
-    text = Text(tuple(files), tuple(texts))
+    text = Text(tuple(files), tuple(map(_lines, texts)))
     try:
         declared = lifted(parsed(text.whole, limits))
         builder = Builder(declared, Grounder(declared))
         model = builder.model()
     except ParseFault as fault:
-        raise ModelError([text.fault(str(fault), fault.offset)]) from None
+        alone = "domain block" in str(fault) or "instance block" in str(fault)
+        hint = "name both files: DOMAIN.rddl+INSTANCE.rddl" if alone and len(texts) == 1 else ""
+        raise ModelError([text.fault(str(fault), fault.offset, hint)]) from None
     except GroundingFault as fault:
         raise ModelError([text.fault(str(fault), fault.offset, fault.hint)]) from None
     warnings = [Fault(note, severity="warning") for note in builder.notes]
@@ -82,6 +84,11 @@ def read_rddl_with_warnings(
         note = f"values of {names} are irrational: they are rounded to {DIGITS} significant digits"
         warnings.append(Fault(note, severity="warning"))
     return model, tuple(warnings), _finder(declared, text)
+
+
+def _lines(text: str) -> str:
+    """`text` with one kind of line end, and no byte order mark."""
+    return text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _finder(declared: Lifted, text: Text) -> Locate:
