@@ -9,24 +9,32 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 
+@cache
+def parser() -> Any:
+    """pyRDDLGym's parser."""
+    from ply import yacc
+    from pyRDDLGym.core.parser.parser import RDDLParser
+
+    made = RDDLParser()
+    made.build(debug=False, write_tables=False, errorlog=yacc.NullLogger())
+    return made
+
+
 class Oracle:
     """One instance, read by pyRDDLGym."""
 
     def __init__(self, text: str) -> None:
-        from ply import yacc
         from pyRDDLGym.core.compiler.model import RDDLLiftedModel
-        from pyRDDLGym.core.parser.parser import RDDLParser
         from pyRDDLGym.core.simulator import RDDLSimulator
 
-        parser = RDDLParser()
-        parser.build(debug=False, write_tables=False, errorlog=yacc.NullLogger())
-        self.rddl = RDDLLiftedModel(parser.parse(text))
+        self.rddl = RDDLLiftedModel(parser().parse(text))
         self.simulator = RDDLSimulator(self.rddl)
         self.simulator._sample_bernoulli = self._probability
 
