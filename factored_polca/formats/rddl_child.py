@@ -407,6 +407,8 @@ def check(ast: Any, lifted: Any) -> None:
         instance.discount = 1.0
     try:
         lifted(ast)
+    except (MemoryError, RecursionError):
+        raise
     except Exception as error:
         text = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).strip().partition("\n")[0]
         raise FaultError(text.replace("<", "'").replace(">", "'")[:400] or type(error).__name__) from None

@@ -16,7 +16,7 @@ from typing import Final
 
 from factored_polca.formats.rddl_choices import CHOICES
 from factored_polca.formats.rddl_fault import GroundingFault
-from factored_polca.formats.rddl_lifted import Args, Definition, Fluent, Lifted, Node
+from factored_polca.formats.rddl_lifted import Args, Definition, Fluent, Lifted, Node, number
 from factored_polca.formats.rddl_operators import OPERATORS
 from factored_polca.formats.rddl_terms import BOOL, NUMBER, Term, Terms
 from factored_polca.models.errors import ModelError
@@ -101,7 +101,10 @@ class Grounder:
     def _ground(self, node: Node, binding: Binding) -> Term:
         match node.kind:
             case "number":
-                return self.terms.number(Fraction(node.text))
+                try:
+                    return self.terms.number(number(node.text))
+                except ModelError as error:
+                    raise self.fault(node, str(error)) from None
             case "boolean":
                 return self.terms.truth(node.text == "true")
             case "name":

@@ -173,7 +173,9 @@ def _index(value: object, count: int) -> int:
 
 
 def _node(row: object, index: int) -> Node:
-    if not isinstance(row, list) or len(row) != 6 or row[0] not in KINDS or not isinstance(row[3], list):
+    if not isinstance(row, list) or len(row) != 6 or not isinstance(row[3], list):
+        _broken()
+    if _text(row[0]) not in KINDS:
         _broken()
     binders = row[4]
     if not isinstance(binders, list):
@@ -203,7 +205,7 @@ def _value(data: object) -> Scalar:
 
 
 def _fluent(row: object) -> Fluent:
-    if not isinstance(row, list) or len(row) != 6 or row[1] not in FLUENTS:
+    if not isinstance(row, list) or len(row) != 6 or _text(row[1]) not in FLUENTS:
         _broken()
     default = None if row[4] is None else _value(row[4])
     return Fluent(_text(row[0]), row[1], _text(row[2]), _texts(row[3]), default, _integer(row[5]))

@@ -87,6 +87,10 @@ def _not_installed(message: str) -> list[Fault]:
 def _reached(found: Any, status: int, limits: Limits) -> str:
     if isinstance(found, dict) and found.get("limit") == "output":
         return f"the parsed text takes more than {limits.output_bytes >> 20} MiB, the most that is read"
+    if isinstance(found, dict):
+        return (
+            f"parsing takes more than {limits.memory_bytes >> 20} MiB of memory, the most that is allowed"
+        )
     if status in (-24, -9):  # SIGXCPU, or SIGKILL after it
         return f"parsing took more than {limits.cpu_seconds} s of processor time, the most that is allowed"
     return (

@@ -40,6 +40,7 @@ _SAME: Final = {
     "less_equal": "less_equal",
 }  # fmt: skip
 _FUNCTIONS: Final = {"abs": "absolute", "div": "floor_divide", "mod": "modulo"}
+DIVISION: Final = "division by zero"
 _UNDEFINED: Final = Operation("divide", (ONE, ZERO))
 
 
@@ -104,7 +105,7 @@ class Translator:
             case "function":
                 return self._function(row, parts)
             case "undefined":
-                return _UNDEFINED
+                return _UNDEFINED if row.data == DIVISION else Constant(row.data)  # which is no value
         raise AssertionError(f"a term {row.op} is left where a value is needed")
 
     def _function(self, row: Row, parts: tuple[Expression, ...]) -> Expression:
