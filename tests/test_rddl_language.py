@@ -67,6 +67,8 @@ BOOLEANS: list[tuple[str, Callable[[Mapping[str, Any]], Any]]] = [
     ("KronDelta((x + y) >= 1)", lambda s: s["x"] + s["y"] >= 1),
     ("KronDelta((x + y) < 1)", lambda s: s["x"] + s["y"] < 1),
     ("KronDelta((x - y) > 0)", lambda s: s["x"] - s["y"] > 0),
+    ("KronDelta((1 - x - y + 1 - 1 + 2 * x - (y - x)) == 2)", lambda s: 1 + 2 * s["x"] - 2 * s["y"] == 2),
+    ("KronDelta((" + "x - y + " * 200 + "1) > 0)", lambda s: s["x"] >= s["y"]),
     ("KronDelta(-x <= -1)", lambda s: s["x"]),
     ("KronDelta(x)", lambda s: s["x"]),
     ("x", lambda s: s["x"]),
@@ -296,6 +298,15 @@ def test_interm_and_derived_fluents() -> None:
     laws(model, "a", "hit", lambda s: coin(0), following=True)
     (reward,) = model.rewards
     assert references(reward) == {Reference("shock", primed=True)}
+
+
+def test_a_drawn_integer_between_two_states() -> None:
+    fluents = "k : { state-fluent, int, default = 0 }; step : { interm-fluent, int, level = 1 };"
+    cpfs = "k' = min[2, k + step]; step = if (a) then 2 * Bernoulli(0.25) else 0;"
+    model = read(rddl(fluents + A, cpfs))
+    assert [(f.name, f.values) for f in model.features] == [("k", (0, 2)), ("step", (0, 2))]
+    laws(model, "a", "step", lambda s: {0: F(3, 4), 2: F(1, 4)})
+    laws(model, "a", "k", lambda s: {min(2, s["k"] + s["step'"]): F(1)}, following=True)
 
 
 def test_next_states_may_depend_on_each_other() -> None:

@@ -71,6 +71,10 @@ def read_rddl_with_warnings(
         declared = lifted(parsed(text.whole, limits))
         builder = Builder(declared, Grounder(declared))
         model = builder.model()
+    except RecursionError:
+        raise ModelError(
+            "expressions, or interm-fluents that hang on each other, are nested too deeply"
+        ) from None
     except ParseFault as fault:
         alone = "domain block" in str(fault) or "instance block" in str(fault)
         hint = "name both files: DOMAIN.rddl+INSTANCE.rddl" if alone and len(texts) == 1 else ""

@@ -28,6 +28,7 @@ from typing import Any
 MAXIMUM_NODES = 300_000
 DECIMAL = re.compile(r"[0-9]*\.[0-9]+")
 CHAINS = {"+", "*", "^", "&", "|"}
+OTHERS = {"/", "~", "=>", "<=>", "==", "~=", "<", "<=", ">", ">="}
 AGGREGATES = {"forall", "exists", "sum", "prod", "avg", "min", "max", "argmin", "argmax"}
 MATRICES = {"det", "inverse", "pinverse", "cholesky"}
 ONCE = {
@@ -64,6 +65,9 @@ class Whole(int):
     offset: int
 
 
+POSITIONED = {"IDENT": Name, "VAR": Name, "ENUM_VAL": Name, "DOUBLE": Decimal, "INTEGER": Whole}
+
+
 class FaultError(Exception):
     """The text is at fault."""
 
@@ -91,20 +95,12 @@ class Positioned:
         if token is None:
             return None
         kind, offset = token.type, token.lexpos
-        value: Any
-        if kind in ("IDENT", "VAR", "ENUM_VAL"):
-            value = Name(token.value)
-        elif kind == "DOUBLE":
-            value = Decimal(token.value)
+        if kind in POSITIONED:
+            token.value = POSITIONED[kind](token.value)
+            token.value.offset = offset
+        if kind == "DOUBLE":
             match = DECIMAL.match(self.data, offset)
-            value.text = match[0] if match else repr(float(token.value))
-        elif kind == "INTEGER":
-            value = Whole(token.value)
-        else:
-            value = None
-        if value is not None:
-            value.offset = offset
-            token.value = value
+            token.value.text = match[0] if match else repr(float(token.value))
         self.notice(kind, offset)
         return token
 
@@ -253,21 +249,9 @@ class Table:
             return row_of("aggregate", head, place(body[0][1][0]), binders), [body[-1]]
         if head in ("-", "+") and len(body) == 1:
             return row_of("operator", "negate" if head == "-" else "plus"), list(body)
-        if head in CHAINS:
-            return row_of("operator", head), chain(head, body)
-        if isinstance(body, tuple) and head in (
-            "-",
-            "/",
-            "~",
-            "=>",
-            "<=>",
-            "==",
-            "~=",
-            "<",
-            "<=",
-            ">",
-            ">=",
-        ):
+        if head in CHAINS or head == "-":
+            return row_of("operator", "+" if head == "-" else head), chain(head, body)
+        if isinstance(body, tuple) and head in OTHERS:
             return row_of("operator", head), list(body)
         if head in MATRICES or head in ("randomvector", "pyfunc"):
             return row_of("unsupported", "python function" if head == "pyfunc" else str(head)), []
@@ -304,13 +288,14 @@ def switch(body: Any) -> tuple[list[Any], list[Any]]:
 
 
 def chain(operator: str, body: Any) -> list[Any]:
-    """a + b + c + d as four parts: the grammar nests them to the left."""
+    """a + b - c + d as four parts, -c among them: the grammar nests them to the left."""
+    family = ("+", "-") if operator in ("+", "-") else (operator,)
     parts: list[Any] = []
     while True:
         left, right = body
-        parts.append(right)
-        if left[0] == operator and isinstance(left[1], tuple) and len(left[1]) == 2:
-            body = left[1]
+        parts.append(("-", (right,)) if operator == "-" else right)
+        if left[0] in family and isinstance(left[1], tuple) and len(left[1]) == 2:
+            operator, body = left[0], left[1]
             continue
         parts.append(left)
         return parts[::-1]

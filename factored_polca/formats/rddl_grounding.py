@@ -22,7 +22,7 @@ from factored_polca.formats.rddl_terms import BOOL, NUMBER, Term, Terms
 from factored_polca.models.errors import ModelError
 from factored_polca.models.scalars import Scalar
 
-MAXIMUM_STEPS: Final = 20_000_000
+MAXIMUM_STEPS: Final = 10_000_000
 """Lifted parts that are grounded, each counted for each binding."""
 MAXIMUM_CHAIN: Final = 40
 """Interm-fluents that hang on each other, by name."""

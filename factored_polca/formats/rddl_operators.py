@@ -43,9 +43,6 @@ def ground_operator(grounder: Grounder, node: Node, binding: Binding) -> Term:
             return same if node.text == "==" else terms.negation(same)
         case "+":
             return terms.sum([grounder.numeric(part, binding) for part in parts])
-        case "-":
-            first, second = (grounder.numeric(part, binding) for part in parts)
-            return terms.sum([first, terms.negative(second)])
         case "negate":
             return terms.negative(grounder.numeric(parts[0], binding))
         case "plus":

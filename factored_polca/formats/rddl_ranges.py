@@ -67,8 +67,8 @@ def closed(terms: Terms, ranges: Ranges, unknown: list[Unknown]) -> Ranges:
             try:
                 after = before | possible(terms, fluent.law, found)
             except Unbounded:
-                after = frozenset[Scalar]()
-            if not 0 < len(after) <= MAXIMUM_VALUES:
+                raise _no_range(fluent.name) from None
+            if len(after) > MAXIMUM_VALUES:
                 raise _no_range(fluent.name)
             if any(not isinstance(value, Fraction) or value.denominator != 1 for value in after):
                 raise ModelError(f"the int-fluent {fluent.name} takes values that are no integers")
@@ -76,6 +76,9 @@ def closed(terms: Terms, ranges: Ranges, unknown: list[Unknown]) -> Ranges:
                 changed = True
                 found |= {(op, fluent.name): after for op in fluent.ops}
         if not changed:
+            for fluent in unknown:
+                if not found[fluent.ops[0], fluent.name]:
+                    raise _no_range(fluent.name)
             return found
     raise _no_range(unknown[0].name)
 

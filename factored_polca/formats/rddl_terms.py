@@ -35,7 +35,7 @@ ACTS: Final = 1
 DRAWS: Final = 2
 """Flags of terms: some part is an action-fluent, some part is a draw."""
 
-MAXIMUM_TERMS: Final = 1_500_000
+MAXIMUM_TERMS: Final = 1_000_000
 
 REFERENCES: Final = frozenset(["now", "next", "act", "random"])
 COMPARISONS: Final = frozenset(["equal", "less", "less_equal"])
