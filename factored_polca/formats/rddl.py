@@ -15,8 +15,9 @@ condition holds, at the start too, the episode has ended.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from factored_polca.formats.rddl_fault import GroundingFault
 from factored_polca.formats.rddl_functions import DIGITS
@@ -68,9 +69,7 @@ def read_rddl_with_warnings(
     """
     text = Text(tuple(files), tuple(map(_lines, texts)))
     try:
-        declared = lifted(parsed(text.whole, limits))
-        builder = Builder(declared, Grounder(declared))
-        model = builder.model()
+        declared, builder, model = built(parsed(text.whole, limits))
     except RecursionError:
         raise ModelError(
             "expressions, or interm-fluents that hang on each other, are nested too deeply"
@@ -88,6 +87,17 @@ def read_rddl_with_warnings(
         note = f"values of {names} are irrational: they are rounded to {DIGITS} significant digits"
         warnings.append(Fault(note, severity="warning"))
     return model, tuple(warnings), _finder(declared, text)
+
+
+def built(data: Mapping[str, Any]) -> tuple[Lifted, Builder, Model]:
+    """The model of what the parsing process says.
+
+    Raises:
+        GroundingFault, ModelError: it is not right, or nothing that is read.
+    """
+    declared = lifted(data)
+    builder = Builder(declared, Grounder(declared))
+    return declared, builder, builder.model()
 
 
 def _lines(text: str) -> str:

@@ -183,10 +183,39 @@ def _node(row: object, index: int) -> Node:
     pairs = [_texts(pair) for pair in binders]
     if any(len(pair) != 2 for pair in pairs):
         _broken()
-    return Node(
+    node = Node(
         row[0], _integer(row[1]), _text(row[2]), tuple(_index(part, index) for part in row[3]),
         tuple((name, kind) for name, kind in pairs), _texts(row[5]),
     )  # fmt: skip
+    return node if _well_formed(node) else _broken()
+
+
+_UNARY: Final = frozenset(["~", "negate", "plus", "Bernoulli", "KronDelta", "DiracDelta"])
+_BINARY: Final = frozenset(["=>", "<=>", "==", "~=", "<", "<=", ">", ">=", "/"])
+_CHAINS: Final = frozenset(["+", "*", "^", "&", "|"])
+
+
+def _well_formed(node: Node) -> bool:
+    """Whether a node has as many parts, bound variables and labels as its kind asks for."""
+    count = len(node.parts)
+    match node.kind:
+        case "operator" | "draw":
+            if node.text in _UNARY:
+                return count == 1
+            if node.kind == "draw":
+                return True
+            return count == 2 if node.text in _BINARY else count > 0 and node.text in _CHAINS
+        case "if":
+            return count == 3
+        case "switch":
+            return count == 1 + sum(1 if label == "default" else 2 for label in node.labels)
+        case "aggregate" | "discrete_over":
+            return count == 1 and len(node.binders) > 0
+        case "discrete":
+            return count == len(node.labels) > 0 and len(node.binders) == 1
+        case "fluent" | "function":
+            return True
+    return count == 0
 
 
 def _refuse_depth(nodes: Iterable[Node]) -> None:

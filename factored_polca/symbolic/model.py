@@ -410,10 +410,12 @@ class _Build:
 
     def expected(self, term: Term, rows: dict[int, RowDiagram], elimination: tuple[int, ...]) -> Term:
         """The expectation over x' of a term."""
+        tested = set(support(term.diagram))
         for index in elimination:
             level = 2 * self.positions[index] + 1
-            if level in support(term.diagram):
+            if level in tested:
                 term = self.expectation(term, index, level, rows.get(index))
+                tested = set(support(term.diagram))
         return term
 
     def expectation(self, term: Term, index: int, level: int, row: RowDiagram | None) -> Term:
