@@ -1,7 +1,7 @@
-"""What the parsing process says is not trusted: mutated answers give a model or a fault, never anything else.
+"""What the parsing process says is not trusted: mutated answers give a model or a fault, nothing else.
 
-The answers of the small texts of these tests are mutated: parts of expressions, declarations and definitions
-are replaced by others or by strange ones.  Seeds are fixed; more of them by `MUTATIONS=20000 pytest ...`.
+The answers for small texts are mutated: parts of expressions, declarations and definitions are replaced by
+others or by strange ones.  The seed is fixed; MUTATIONS in the environment says how many there are.
 """
 
 from __future__ import annotations

@@ -105,13 +105,17 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
     return result
 
 
+_LISTED = re.compile(r"(?:\([^()]*\)|[^,(]|\()+")
+"""Names with commas between them; a comma in parentheses is part of a name, as in move(x1,y2)."""
+
+
 def parse_actions(text: str, model: Model) -> list[str]:
-    """`a,b` as the names of actions, in the model's order.
+    """`a,b` or `move(x1,y2),noop` as the names of actions, in the model's order.
 
     Raises:
         UsageError: an unknown action; the message lists those there are.
     """
-    asked = {name.strip() for name in text.split(",")}
+    asked = {name.strip() for name in _LISTED.findall(text) if name.strip()} or {""}
     known = [action.name for action in model.actions]
     unknown = sorted(asked - set(known))
     if unknown:
