@@ -14,9 +14,11 @@ import pytest
 pytest.importorskip("pyRDDLGym")
 pytest.importorskip("rddlrepository")
 
+from rddl_in_process import run
 from rddl_oracle import Oracle, texts
 
 from factored_polca.explicit.evaluate import distribution, evaluate
+from factored_polca.formats import rddl_process
 from factored_polca.formats.rddl import read_rddl_with_warnings
 from factored_polca.models.expressions import Reference
 
@@ -31,6 +33,11 @@ FOLDERS = [
     for kind in ("MDP", "POMDP")
 ]  # fmt: skip
 TOLERANCE = 1e-11
+
+
+@pytest.fixture(autouse=True)
+def _parsed_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rddl_process, "_run", run)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("pyRDDLGym")
 
+from rddl_in_process import run
 from rddl_texts import SERVERS, rddl
 
 from factored_polca.formats import rddl_process
@@ -24,6 +25,11 @@ A = "a : { action-fluent, bool, default = false };"
 X = "x : { state-fluent, bool, default = false };"
 T = {"types": "t : object;", "objects": "t : { t1, t2 };"}
 P = "p(t) : { state-fluent, bool, default = false };"
+
+
+@pytest.fixture(name="_parsed_here")
+def _parse_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rddl_process, "_run", run)
 
 
 def fault(text: str, limits: Limits | None = None) -> Fault:
@@ -39,6 +45,7 @@ def at(text: str, part: str) -> tuple[int, int]:
     return before.count("\n") + 1, len(before) - (before.rfind("\n") + 1) + 1
 
 
+@pytest.mark.usefixtures("_parsed_here")
 @pytest.mark.parametrize(
     ("text", "message", "place"),
     [
@@ -105,6 +112,7 @@ def test_each_fault_has_one_message_and_its_place(
         assert (found.file, found.line, found.column) == ("m.rddl", *at(text, place))
 
 
+@pytest.mark.usefixtures("_parsed_here")
 def test_a_row_that_is_no_distribution_is_found_at_its_definition() -> None:
     from factored_polca.symbolic import compile_model
 
@@ -117,6 +125,7 @@ def test_a_row_that_is_no_distribution_is_found_at_its_definition() -> None:
     assert all("a probability is -1/2" in f.message for f in found)
 
 
+@pytest.mark.usefixtures("_parsed_here")
 def test_a_number_that_is_no_truth_value_is_found_where_it_counts() -> None:
     from factored_polca.symbolic import compile_model
 
@@ -156,6 +165,7 @@ def test_a_bomb_of_names_is_stopped() -> None:
     assert "MiB of memory, the most that is allowed" in fault(text, Limits(memory_bytes=1 << 28)).message
 
 
+@pytest.mark.usefixtures("_parsed_here")
 def test_a_bomb_of_bindings_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     from factored_polca.formats import rddl_grounding
 

@@ -13,9 +13,11 @@ import pytest
 
 pytest.importorskip("pyRDDLGym")
 
+from rddl_in_process import run
 from rddl_texts import rddl
 
 from factored_polca.explicit.evaluate import distribution, evaluate
+from factored_polca.formats import rddl_process
 from factored_polca.formats.rddl import read_rddl_with_warnings
 from factored_polca.models import Model, check
 from factored_polca.models.expressions import TRUE, Reference, references
@@ -26,6 +28,11 @@ KEEP = "y' = KronDelta(y);"
 COLOURS = "colour : { @red, @green, @blue };"
 
 Law = Callable[[Mapping[str, Any]], Mapping[Any, F]]
+
+
+@pytest.fixture(autouse=True)
+def _parsed_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rddl_process, "_run", run)
 
 
 def read(text: str) -> Model:

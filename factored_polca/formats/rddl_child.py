@@ -157,8 +157,8 @@ def load(packages: str) -> Any:
     return yacc, grammar, RDDLLiftedModel, NonFluents
 
 
-def parse(text: str, modules: Any) -> Any:
-    """pyRDDLGym's syntax tree of `text`, its tokens with their places."""
+def tools(modules: Any) -> tuple[Any, Any]:
+    """A parser and a lexer of pyRDDLGym's grammar, with our messages."""
     yacc, grammar, _, non_fluents = modules
 
     def refuse_character(self: Any, token: Any) -> None:
@@ -167,7 +167,7 @@ def parse(text: str, modules: Any) -> Any:
     def refuse_token(self: Any, token: Any) -> None:
         if token is None:
             raise FaultError("the text ends in the middle of a block: a closing brace is missing")
-        shown = text[token.lexpos :].split(maxsplit=1)[0][:40]
+        shown = self.lexer.data[token.lexpos :].split(maxsplit=1)[0][:40]
         hint = ""
         if token.type in self.reverse_tokens:
             hint = f"; {self.reverse_tokens[token.type]!r} is a word of the language"
@@ -189,7 +189,12 @@ def parse(text: str, modules: Any) -> Any:
     inner.build(errorlog=yacc.NullLogger())
     parser = type("Parser", (grammar.RDDLParser,), {"p_error": refuse_token})()
     parser.build(debug=False, write_tables=False, errorlog=yacc.NullLogger())
-    parser.lexer = Positioned(inner)
+    return parser, inner
+
+
+def parse(text: str, parser: Any, lexer: Any) -> Any:
+    """pyRDDLGym's syntax tree of `text`, its tokens with their places."""
+    parser.lexer = Positioned(lexer)
     try:
         return parser.parse(text)
     except KeyError as error:
@@ -407,9 +412,14 @@ def answer(text: str, packages: str) -> dict[str, Any]:
         modules = load(packages)
     except ImportError as error:
         return {"missing": str(error)}
+    return described(text, *tools(modules), modules[2])
+
+
+def described(text: str, parser: Any, lexer: Any, lifted: Any) -> dict[str, Any]:
+    """What `text` declares, or what is wrong with it."""
     try:
-        ast = parse(text, modules)
-        check(ast, modules[2])
+        ast = parse(text, parser, lexer)
+        check(ast, lifted)
         return describe(ast)
     except FaultError as fault:
         return {"error": str(fault), "offset": fault.offset}

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Final
@@ -59,13 +59,14 @@ def closed(terms: Terms, ranges: Ranges, unknown: list[Unknown]) -> Ranges:
     found = dict(ranges)
     for fluent in unknown:
         found |= {(op, fluent.name): fluent.first for op in fluent.ops}
-    changed = True
+    looked_at: dict[str, Ranges] = {}
     for _ in range(MAXIMUM_ROUNDS):
         changed = False
         for fluent in unknown:
             before = found[fluent.ops[0], fluent.name]
             try:
-                after = before | possible(terms, fluent.law, found)
+                after = before | possible(terms, fluent.law, found, looked_at.get(fluent.name))
+                looked_at[fluent.name] = dict(found)
             except Unbounded:
                 raise _no_range(fluent.name) from None
             if len(after) > MAXIMUM_VALUES:
@@ -90,8 +91,10 @@ def _no_range(name: str) -> ModelError:
     )
 
 
-def possible(terms: Terms, root: Term, ranges: Ranges) -> Values:
+def possible(terms: Terms, root: Term, ranges: Ranges, before: Ranges | None = None) -> Values:
     """The values that a term can have, at least; few combinations of its parents' values are all tried.
+
+    Combinations from `before`, whose ranges are smaller, may be left out.
 
     Raises:
         Unbounded: too many.
@@ -101,10 +104,20 @@ def possible(terms: Terms, root: Term, ranges: Ranges) -> Values:
     if math.prod(sizes) > _COMBINATIONS:
         return spread(terms, root, ranges)
     result: set[Scalar] = set()
-    for chosen in itertools.product(*(ranges[reference] for reference in needed)):
+    smaller = None if before is None else [before[r] for r in needed]
+    for chosen in _combinations([ranges[r] for r in needed], smaller):
         single = {r: frozenset([value]) for r, value in zip(needed, chosen, strict=True)}
         result |= spread(terms, root, single)
     return frozenset(result)
+
+
+def _combinations(sets: list[Values], before: list[Values] | None) -> Iterator[tuple[Scalar, ...]]:
+    """The combinations of values, those of the smaller sets left out: by the first that has a new value."""
+    if before is None:
+        yield from itertools.product(*sets)
+        return
+    for i in range(len(sets)):
+        yield from itertools.product(*before[:i], sets[i] - before[i], *sets[i + 1 :])
 
 
 def spread(terms: Terms, root: Term, ranges: Ranges) -> Values:
