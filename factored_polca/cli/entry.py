@@ -28,7 +28,7 @@ def commands() -> dict[str, Callable[..., int]]:
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
-        "figure": figure.figure,
+        "figure": figure.figure, "bench": run_bench, "study": run_study,
     }  # fmt: skip
 
 
@@ -37,6 +37,20 @@ def run_plan(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.cli.run import run as work
 
     return work(arguments, output)
+
+
+def run_study(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `study`, which needs none of the libraries that compute."""
+    from factored_polca.cli.study import study as work
+
+    return work(arguments, output)
+
+
+def run_bench(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `bench`."""
+    from factored_polca.cli.bench import bench
+
+    return bench(arguments, output)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -81,6 +81,7 @@ def options_of(arguments: argparse.Namespace) -> Options:
         gap=arguments.gap,
         trials=arguments.trials,
         assume_observed=arguments.polca,
+        interchangeable=arguments.interchangeable,
     )
 
 

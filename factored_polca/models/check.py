@@ -46,8 +46,9 @@ def _faults(model: Model) -> Iterator[Fault]:
         yield Fault("the model has no action", ("actions",))
     names = [action.name for action in model.actions]
     yield from _duplicates("action", names, ("actions",))
+    sound: set[Expression] = set()
     for action in model.actions:
-        yield from _check_action(model, action)
+        yield from _check_action(model, action, sound)
     for index, term in enumerate(model.rewards):
         yield from _check_expression(model, term, ("reward", str(index)), primed=True, observed=True)
     yield from _check_expression(model, model.terminal, ("terminal",))
@@ -111,7 +112,8 @@ def _check_numbers(model: Model) -> Iterator[Fault]:
             )
 
 
-def _check_action(model: Model, action: Action) -> Iterator[Fault]:
+def _check_action(model: Model, action: Action, sound: set[Expression]) -> Iterator[Fault]:
+    """The faults of an action; `sound` holds effects without any, which other actions may have too."""
     path: Path = ("actions", action.name)
     features = {feature.name: feature for feature in model.features}
     channels = {observation.name: observation for observation in model.observations}
@@ -124,9 +126,14 @@ def _check_action(model: Model, action: Action) -> Iterator[Fault]:
         if count > 1:
             yield Fault(f"{count} effects on {name!r}", (*path, "effects", name))
     for name, effect in action.effects:
-        yield from _check_expression(
-            model, effect, (*path, "effects", name), primed=True, distribution=True
+        if effect in sound:
+            continue
+        found = list(
+            _check_expression(model, effect, (*path, "effects", name), primed=True, distribution=True)
         )
+        yield from found
+        if not found:
+            sound.add(effect)
     yield from _check_cycle(action, path)
     yield from _check_expression(model, action.applicable, (*path, "applicable"))
     if model.observability == "partial" and action.applicable != _TRUE:
