@@ -180,7 +180,7 @@ def parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
     add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
-    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
+    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, 4c, table1."))
     add_study(
         command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
     )
@@ -238,6 +238,9 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the model"
         )
         found.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
+        return found
+
+    def with_trials(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "--trials",
             type=counting,
@@ -245,12 +248,15 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             metavar="N",
             help=f"trials a task of PolCA+ ({TRIALS})",
         )
-        return found
 
     def with_picture(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "model", metavar="MODEL", nargs="?", default="nursebot", help="nursebot if not given"
         )
+        with_trials(found)
+        with_output(found)
+
+    def with_output(found: argparse.ArgumentParser) -> None:
         found.add_argument("-o", "--output", metavar="FILE.png", help="draw it (needs matplotlib)")
 
     def with_flat_trials(found: argparse.ArgumentParser) -> None:
@@ -274,4 +280,11 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
     found.add_argument(
         "--perturbation", type=discount, metavar="Q", help="by up to which share they are changed (0.2)"
     )
-    with_flat_trials(one("table1", "What the controller does in the dialogue of the paper's Table 1."))
+    found = one("4c", "What PolCA and learners store for Taxi and Taxi2, and how fast these learn.")
+    found.add_argument(
+        "--episodes", type=counting, metavar="N", help="of each learner; 100 for each state if not given"
+    )
+    with_output(found)
+    found = one("table1", "What the controller does in the dialogue of the paper's Table 1.")
+    with_trials(found)
+    with_flat_trials(found)
