@@ -136,9 +136,23 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
     Raises:
         ModelError: no such file, no known format, or a text at fault; names file, line and column.
     """
+    format_of(path)
+    try:
+        data = _bytes(Path(path))
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    return document_of(data, path, overrides)
+
+
+def document_of(data: bytes, path: str | Path, overrides: Mapping[str, str] | None = None) -> Document:
+    """The model in `data`, the bytes of a file called `path`: its extension tells the format.
+
+    Raises:
+        ModelError: no known format, or a text at fault; names file, line and column.
+    """
     chosen = format_of(path)
     try:
-        document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
+        document = chosen.read(_decoded(data), overrides or {}, Path(path).stem)
     except ModelError as error:
         raise error.in_file(str(path)) from None
 
@@ -149,7 +163,7 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
     return replace(document, warnings=warnings, locate=locate)
 
 
-def _text(path: Path) -> str:
+def _bytes(path: Path) -> bytes:
     try:
         with path.open("rb") as stream:
             data = stream.read(MAXIMUM_BYTES + 1)
@@ -158,8 +172,13 @@ def _text(path: Path) -> str:
         raise ModelError([Fault("there is no such file", hint=f"formats are {listed}")]) from None
     except (OSError, ValueError) as error:
         raise ModelError(f"the file can't be read: {_reason(error)}") from None
+    return data
+
+
+def _decoded(data: bytes) -> str:
     if len(data) > MAXIMUM_BYTES:
-        raise ModelError(f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read")
+        message = f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read"
+        raise ModelError([Fault(message, line=1, column=1)])
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
