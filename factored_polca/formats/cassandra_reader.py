@@ -58,7 +58,9 @@ class _Reader:
         self.entries = Entries(self.tokens, self.numbers, self.preamble, self.steps)
 
     def model(self, name: str) -> tuple[Model, tuple[Fault, ...]]:
+        indices = (self.preamble.states, self.preamble.actions, self.preamble.observations)
         try:
+            self.steps.count(sum(len(index) for index in indices if index is not None))
             self.entries.read()
             initial = self._initial()
             effects, senses = self._effects(), self._senses()

@@ -18,7 +18,8 @@ import tempfile
 from pathlib import Path
 
 from .campaign import Campaign, guarded, input_of, run, summary, verdict
-from .readers import READERS
+from .readers import READERS, prepared
+from .work import watched
 
 
 def main() -> int:
@@ -43,7 +44,7 @@ def main() -> int:
             data = input_of(given.seed, name, given.input)
             sys.stdout.buffer.write(data + b"\n")
             sys.stdout.flush()
-            with guarded():
+            with guarded(), watched(), prepared():
                 print(f"-- {name}:", verdict(READERS[name], data, 0))
         return 0
     path = given.state or Path(tempfile.mkdtemp()) / "fuzz.json"

@@ -15,9 +15,9 @@ from random import Random
 from typing import Any, Final
 
 from .choices import Choices
-from .readers import READERS, Reader
+from .readers import READERS, Reader, prepared
 from .verdict import Finding, judged
-from .work import install
+from .work import watched
 
 BLOCK: Final = 1_000
 """Inputs between two writings of the state."""
@@ -108,7 +108,6 @@ def input_of(seed: int, name: str, index: int) -> bytes:
 
 def verdict(reader: Reader, data: bytes, index: int) -> str | Finding:
     """What the reader does; slowness is a finding."""
-    install()
     try:
         return judged(reader, data, closely=index % CLOSELY == 0)
     except Slow:
@@ -117,7 +116,7 @@ def verdict(reader: Reader, data: bytes, index: int) -> str | Finding:
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """End a block that takes more than `SECONDS`."""
+    """End a block that takes more than `SECONDS` of the processor's time."""
 
     def stop(*_: object) -> None:
         raise Slow
@@ -133,6 +132,11 @@ def guarded() -> Iterator[None]:
 
 def run(campaign: Campaign, names: list[str], inputs: int, say: Callable[[str], None]) -> None:
     """Blocks of the readers in turns, until each has read `inputs`."""
+    with watched(), prepared():
+        _run(campaign, names, inputs, say)
+
+
+def _run(campaign: Campaign, names: list[str], inputs: int, say: Callable[[str], None]) -> None:
     while waiting := [name for name in names if campaign.of(name)["inputs"] < inputs]:
         for name in waiting:
             campaign.block(name)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
+from unittest.mock import patch
 
 from factored_polca import array_pomdp, library
 from factored_polca.formats import alpha_file, cassandra_factoring, files, graph_file, read_native
@@ -124,12 +126,15 @@ GRAPHS: Final = (
 )
 
 
-@cache
-def _factored_once() -> None:
-    """What the readers make of the arrays, which are always the same, is made once."""
+@contextmanager
+def prepared() -> Iterator[None]:
+    """Within it what the readers make of `_arrays` is made once: their work on texts is what counts."""
     made = cassandra_factoring.factored(_arrays())
-    for module in (alpha_file, graph_file):
-        module.factored = lambda arrays: made  # type: ignore[attr-defined]
+    with (
+        patch.object(alpha_file, "factored", lambda _: made),
+        patch.object(graph_file, "factored", lambda _: made),
+    ):
+        yield
 
 
 def _policy(
@@ -140,7 +145,6 @@ def _policy(
     read: Any,
 ) -> Reader:
     def located(data: bytes, name: str) -> Any:
-        _factored_once()
         try:
             return read(data.decode("utf-8", "replace"), _arrays())
         except ModelError as error:

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 from factored_polca.formats import Document, read_native, write_native
 from factored_polca.models import Model, ModelError, TaskHierarchy, check, check_tasks
+from factored_polca.models.model import replace_fields
 
 from .readers import Reader
 from .work import WorkExceeded, counted
@@ -116,6 +117,8 @@ def names_of(document: Document) -> list[str]:
 def _again(document: Document) -> Finding | None:
     """An accepted model is sound, and the same after it was written and read."""
     model: Model = document.model
+    if model.discount == 1 and model.horizon is None:  # what is read may be given a horizon later
+        model = replace_fields(model, horizon=1)
     faults = check(model) + (check_tasks(model, document.tasks) if document.tasks else [])
     if faults:
         return Finding(f"accepted, though {_words(faults[0].message)}", str(faults[0]))

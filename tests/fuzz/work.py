@@ -1,6 +1,6 @@
 """The work of a reader, counted: its own counters hold, and they count what is done.
 
-Readers count tokens, nodes and steps against limits, which no input may pass.  `LIMITS` lowers them here,
+Readers count tokens, nodes and steps against limits, which no input may pass.  `watched` lowers them,
 so that inputs of a few thousand bytes reach them.  That the counters count is checked by another: the
 interpreter's calls of functions, which must stay below a multiple of what was counted.
 """
@@ -8,9 +8,10 @@ interpreter's calls of functions, which must stay below a multiple of what was c
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final
+from unittest.mock import patch
 
 from factored_polca.formats import cassandra_layers, spudd_trees
 from factored_polca.models import work
@@ -45,26 +46,26 @@ class _Counters:
 _COUNTERS: Final = _Counters()
 
 
-def install() -> None:
-    """Lower the limits and note each counter that is made; for the whole process."""
-    if getattr(spudd_trees.Forest, "noted", False):
-        return
-    for module in (spudd_trees, cassandra_layers, work):
-        module.MAXIMUM_STEPS = LIMIT  # type: ignore[attr-defined]
-    spudd_trees.MAXIMUM_EXPANSION = LIMIT // 10
-    for kind in (spudd_trees.Forest, cassandra_layers.Steps, work.Work):
-        _noted(kind)
+@contextmanager
+def watched() -> Iterator[None]:
+    """Within it limits are lower, and each counter that is made is noted."""
+    with ExitStack() as stack:
+        for module in (spudd_trees, cassandra_layers, work):
+            stack.enter_context(patch.object(module, "MAXIMUM_STEPS", LIMIT))
+        stack.enter_context(patch.object(spudd_trees, "MAXIMUM_EXPANSION", LIMIT // 10))
+        for kind in (spudd_trees.Forest, cassandra_layers.Steps, work.Work):
+            stack.enter_context(patch.object(kind, "__init__", _noting(kind.__init__)))
+        yield
 
 
-def _noted(kind: Any) -> None:
-    made = kind.__init__
+def _noting(made: Callable[..., None]) -> Callable[..., None]:
+    """A constructor that notes what it makes."""
 
     def init(self: Any, *arguments: Any, **named: Any) -> None:
         made(self, *arguments, **named)
         _COUNTERS.made.append(self)
 
-    kind.__init__ = init
-    kind.noted = True
+    return init
 
 
 @contextmanager
