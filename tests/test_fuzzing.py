@@ -177,7 +177,7 @@ def test_work_beyond_the_count_is_noticed() -> None:
     with pytest.raises(WorkExceeded, match="calls and returns"), counted(10, calls=True):
         [abs(number) for number in range(20_000)]
     with pytest.raises(WorkExceeded, match="steps were counted"), counted(10, calls=False):
-        Work().count(10 * LIMIT)
+        Work().count(100 * LIMIT)
     with counted(10, calls=True):
         assert not Work().count(LIMIT + 1)
     assert work.MAXIMUM_STEPS == LIMIT
