@@ -94,7 +94,9 @@ BOMBS = {
 
 @pytest.mark.parametrize(("name", "text"), BOMBS.values(), ids=BOMBS.keys())
 def test_bombs_are_read_or_refused_within_the_budget(name: str, text: str) -> None:
-    outcome = judged(READERS[name], text.encode(), closely=True)
+    reader = READERS[name]
+    judged(reader, reader.corpus()[0])  # modules are loaded before calls are counted
+    outcome = judged(reader, text.encode(), closely=True)
     assert not isinstance(outcome, Finding), f"{outcome.sign}\n{outcome.detail}"
 
 

@@ -50,17 +50,15 @@ class _Reader:
     def __init__(self, text: str) -> None:
         self.tokens = Tokens(text)
         self.numbers = Numbers(self.tokens)
-        self.preamble = read_preamble(self.tokens, self.numbers)
         self.steps = Steps()
+        self.preamble = read_preamble(self.tokens, self.numbers, self.steps)
         self.ledger = Ledger(self.tokens.fault)
         self.decisions = Decisions(self.steps)
         self.place = self.tokens.token.start  # what is being worked on, for messages
         self.entries = Entries(self.tokens, self.numbers, self.preamble, self.steps)
 
     def model(self, name: str) -> tuple[Model, tuple[Fault, ...]]:
-        indices = (self.preamble.states, self.preamble.actions, self.preamble.observations)
         try:
-            self.steps.count(sum(len(index) for index in indices if index is not None))
             self.entries.read()
             initial = self._initial()
             effects, senses = self._effects(), self._senses()
