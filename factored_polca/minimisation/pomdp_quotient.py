@@ -32,7 +32,6 @@ from factored_polca.minimisation.observations import count_before
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import FloatArray, Int32Array, Int64Array
 from factored_polca.minimisation.quotient import (
-    as_float,
     block_texts,
     distinct_rewards,
     exact_rewards,
@@ -44,6 +43,7 @@ from factored_polca.models import Fault, ModelError, Value
 from factored_polca.models.features import position
 from factored_polca.models.scalars import describe, scalar
 from factored_polca.symbolic import SymbolicModel
+from factored_polca.symbolic.floats import as_float
 
 MAXIMUM_OBSERVATIONS: Final = 1_000
 """Largest number of joint observations of one choice, proportional columns not merged yet."""

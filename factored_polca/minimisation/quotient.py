@@ -35,11 +35,9 @@ from factored_polca.minimisation.push import (
     row_table,
     rows_at,
 )
-from factored_polca.models import Fault, LimitReached, ModelError
+from factored_polca.models import LimitReached
 from factored_polca.symbolic import RowDiagram, SymbolicModel
-
-LARGEST_REWARD_EXPONENT = 200
-LARGEST_REWARD = 10**LARGEST_REWARD_EXPONENT
+from factored_polca.symbolic.floats import as_float
 
 
 @dataclass(frozen=True)
@@ -148,18 +146,6 @@ def exact_rewards(
     """The exact reward of a primitive at each of several states [state, feature]."""
     sums, place = distinct_rewards(process, primitive, states)
     return [sums[index] for index in place.tolist()]
-
-
-def as_float(reward: Fraction, action: str) -> float:
-    """A reward as a float.
-
-    Raises:
-        ModelError: so large that sums of it would leave the range of floats.
-    """
-    if abs(reward) > LARGEST_REWARD:
-        message = f"action {action!r} has a reward beyond 10^{LARGEST_REWARD_EXPONENT}"
-        raise ModelError([Fault(message, ("reward",), "values are floats: scale the rewards down")])
-    return float(reward)
 
 
 def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
