@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
-from factored_polca.diagrams.jit import inline, int64, kernel
+from factored_polca.diagrams.jit import inline, int64, lean_kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
@@ -35,9 +35,12 @@ from factored_polca.diagrams.nodes import (
 (
     FIELD_ADD, FIELD_SUBTRACT, FIELD_MULTIPLY,
     FLOAT_ADD, FLOAT_SUBTRACT, FLOAT_MULTIPLY, FLOAT_MINIMUM, FLOAT_MAXIMUM, FLOAT_LESS,
-    AND, OR, XOR, DIFFERENCE, EQUAL, PAIR,
-) = range(1, 16)  # fmt: skip
-"""Operator codes."""
+    AND, OR, XOR, DIFFERENCE, EQUAL, PAIR, OVERRIDE,
+) = range(1, 17)  # fmt: skip
+"""Operator codes.  OVERRIDE(a, b) is b where the index a is 0, else a - 1; its left identity is 0."""
+
+PAIR_TOUCHED = 17
+"""A key for the computed cache, not a code: PAIR with 0 as right absorbing element."""
 
 CODE, LEFT_IDENTITY, RIGHT_IDENTITY, LEFT_ABSORBING, RIGHT_ABSORBING, COMMUTES, SAME, KEY = range(8)
 """Places in the row of integers that describes an operator to the kernel: nodes, or 0 for none.
@@ -60,7 +63,7 @@ def float_payload(value: float) -> np.uint64:
     return np.float64(value + 0.0).view(np.uint64)
 
 
-@kernel
+@lean_kernel
 def leaf_value(code: int, x: np.uint64, y: np.uint64, prime: np.uint64, inverse: np.uint64) -> np.uint64:
     """The payload of op(x, y) for payloads x, y; conditions need none, see `shortcut`."""
     if code == FIELD_ADD:
@@ -117,7 +120,7 @@ def cache_index(key: int, a: int, b: int, mask: int) -> int:
     return int64(h >> np.uint64(32)) & mask
 
 
-@kernel
+@lean_kernel
 def apply_binary(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     op: Int64Array, field: npt.NDArray[np.uint64], stack: Int32Array, results: Int32Array,
@@ -132,93 +135,101 @@ def apply_binary(
     mask = (len(cache) >> 2) - 1
     key = op[KEY]
     code = op[CODE]
-    words = np.empty(2, np.int32)
     sp = state[0]
     rp = state[1]
     budget = STEPS
     while sp > 0:
-        budget -= 1
+        f = 4 * (sp - 1)
+        a = int64(stack[f])
+        b = int64(stack[f + 1])
+        level = int64(stack[f + 2])
+        k = int64(stack[f + 3])
+        if level < 0 and k == 1:
+            break
+        size = int64(1) if level < 0 else int64(arity[level])
+        budget -= 1 + size - k
         if budget < 0:
             state[0] = sp
             state[1] = rp
             head[2] += STEPS
             return YIELDED
-        f = 4 * (sp - 1)
-        a = int64(stack[f])
-        b = int64(stack[f + 1])
-        level = stack[f + 2]
-        k = stack[f + 3]
-        if level < 0:
-            if k == 1:
-                break
-        elif k == arity[level]:
-            r = find_or_add(pool, head, unique, arity, int64(level), results, rp - arity[level])
-            if r < 0:
-                state[0] = sp
-                state[1] = rp
-                head[2] += STEPS - budget
-                return FULL
-            i = 4 * cache_index(key, a, b, mask)
-            cache[i] = a
-            cache[i + 1] = b
-            cache[i + 2] = key
-            cache[i + 3] = r
-            rp -= arity[level]
+        split_a = level >= 0 and pool[a] == level
+        split_b = level >= 0 and pool[b] == level
+        down = False
+        while k < size:
+            x = int64(pool[a + 2 + k]) if split_a else a
+            y = int64(pool[b + 2 + k]) if split_b else b
+            r = shortcut(op, x, y)
+            if r == 0:
+                lx = pool[x]
+                ly = pool[y]
+                if lx == leaf_level and (ly == leaf_level or code == OVERRIDE):
+                    if code == EQUAL:
+                        value = _ZERO
+                    elif AND <= code <= DIFFERENCE:
+                        return INVALID
+                    elif code == PAIR:
+                        value = (np.uint64(x) << _S32) | np.uint64(y)
+                    elif code == OVERRIDE:
+                        value = payload(pool, x) - _ONE
+                    else:
+                        value = leaf_value(code, payload(pool, x), payload(pool, y), field[0], field[1])
+                    results[rp] = np.int32(value & _LOW)
+                    results[rp + 1] = np.int32(value >> _S32)
+                    r = find_or_add(pool, head, unique, arity, leaf_level, results, rp)
+                    if r < 0:
+                        stack[f + 3] = k
+                        state[0] = sp
+                        state[1] = rp
+                        head[2] += STEPS - budget
+                        return FULL
+                else:
+                    if op[COMMUTES] != 0 and x > y:
+                        x, y = y, x
+                        lx, ly = ly, lx
+                    i = 4 * cache_index(key, x, y, mask)
+                    if cache[i] == x and cache[i + 1] == y and cache[i + 2] == key:
+                        r = int64(cache[i + 3])
+                    else:
+                        stack[f + 3] = k + 1
+                        stack[f + 4] = x
+                        stack[f + 5] = y
+                        stack[f + 6] = min(lx, ly)
+                        stack[f + 7] = 0
+                        sp += 1
+                        down = True
+                        break
             results[rp] = r
             rp += 1
-            sp -= 1
+            k += 1
+        if down:
             continue
-        else:
-            if pool[a] == level:
-                a = int64(pool[a + 2 + k])
-            if pool[b] == level:
-                b = int64(pool[b + 2 + k])
-        r = shortcut(op, a, b)
-        if r == 0:
-            la = pool[a]
-            lb = pool[b]
-            if la == leaf_level and lb == leaf_level:
-                if code == EQUAL:
-                    value = _ZERO
-                elif AND <= code <= DIFFERENCE:
-                    return INVALID
-                elif code == PAIR:
-                    value = (np.uint64(a) << _S32) | np.uint64(b)
-                else:
-                    value = leaf_value(code, payload(pool, a), payload(pool, b), field[0], field[1])
-                words[0] = np.int32(value & _LOW)
-                words[1] = np.int32(value >> _S32)
-                r = find_or_add(pool, head, unique, arity, leaf_level, words, 0)
-                if r < 0:
-                    state[0] = sp
-                    state[1] = rp
-                    head[2] += STEPS - budget
-                    return FULL
-            else:
-                if op[COMMUTES] != 0 and a > b:
-                    a, b = b, a
-                    la, lb = lb, la
-                i = 4 * cache_index(key, a, b, mask)
-                if cache[i] == a and cache[i + 1] == b and cache[i + 2] == key:
-                    r = int64(cache[i + 3])
-                else:
-                    stack[f + 3] = k + 1
-                    stack[f + 4] = a
-                    stack[f + 5] = b
-                    stack[f + 6] = min(la, lb)
-                    stack[f + 7] = 0
-                    sp += 1
-                    continue
-        stack[f + 3] = k + 1
+        if level < 0:
+            stack[f + 3] = 1
+            continue
+        r = find_or_add(pool, head, unique, arity, level, results, rp - size)
+        if r < 0:
+            stack[f + 3] = k
+            state[0] = sp
+            state[1] = rp
+            head[2] += STEPS - budget
+            return FULL
+        i = 4 * cache_index(key, a, b, mask)
+        cache[i] = a
+        cache[i + 1] = b
+        cache[i + 2] = key
+        cache[i + 3] = r
+        rp -= size
         results[rp] = r
         rp += 1
+        sp -= 1
     head[2] += STEPS - budget
     state[0] = sp
     state[1] = rp
     return DONE
 
 
-@kernel
+@lean_kernel
 def choose(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     true: int, false: int, stack: Int32Array, results: Int32Array, state: Int64Array,

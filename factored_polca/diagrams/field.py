@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import inline
+from factored_polca.diagrams.jit import inline, kernel
 
 MERSENNE_61 = 2**61 - 1
 """The first prime of every computation."""
@@ -71,7 +71,7 @@ def field_subtract(a: np.uint64, b: np.uint64, prime: np.uint64) -> np.uint64:
     return a + prime - b
 
 
-@inline
+@kernel
 def multiply_all(a: UInt64Array, b: UInt64Array, prime: np.uint64, inverse: np.uint64) -> UInt64Array:
     """Elementwise product of two arrays in Montgomery form."""
     result = np.empty_like(a)

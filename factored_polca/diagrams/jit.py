@@ -31,9 +31,20 @@ def kernel(function: Function) -> Function:
     return cast(Function, compiled)
 
 
+def lean_kernel(function: Function) -> Function:
+    """A kernel that makes no arrays, and calls none that does.
+
+    It counts no references to the arrays that it passes on, which took a fifth of the time where small
+    kernels are called for every node.
+    """
+    compiled = numba.njit(cache=True, error_model="numpy", _nrt=False)(function)
+    KERNELS.append(compiled)
+    return cast(Function, compiled)
+
+
 def inline(function: Function) -> Function:
-    """Compile `function` into each kernel that calls it."""
-    return cast(Function, numba.njit(forceinline=True, error_model="numpy")(function))
+    """Compile `function`, which makes no arrays, into each kernel that calls it."""
+    return cast(Function, numba.njit(forceinline=True, error_model="numpy", _nrt=False)(function))
 
 
 def compiled_before() -> bool:

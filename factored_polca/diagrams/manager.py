@@ -221,12 +221,20 @@ class Manager:
         if self.head[0] > self._collect_at:
             self.collect_garbage()
 
+    @property
+    def collect_at(self) -> int:
+        """The end of the pool beyond which the next safe point collects garbage."""
+        return self._collect_at
+
     def _plan_collection(self) -> None:
-        """Collect when the store has doubled, earlier where the memory limit is near."""
+        """Collect when the store has trebled, earlier where the memory limit is near.
+
+        Small stores are quick ones: what fits into the processor's caches.
+        """
         room = len(self.pool)
         if self.bytes + 4 * (2 * room) <= self.memory_limit:
             room *= 2
-        self._collect_at = min(max(1 << 22, 2 * self._live), (self._live + room) // 2)
+        self._collect_at = min(max(1 << 18, 3 * self._live), (self._live + room) // 2)
 
     def collect_garbage(self) -> None:
         """Drop every node that no diagram reaches; all handles stay valid, caches are emptied.

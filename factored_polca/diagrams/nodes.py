@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import inline, int64, kernel
+from factored_polca.diagrams.jit import inline, int64, kernel, lean_kernel
 
 Int32Array = npt.NDArray[np.int32]
 Int64Array = npt.NDArray[np.int64]
@@ -51,14 +51,14 @@ def mix(h: np.uint64, word: int) -> np.uint64:
     return h ^ (h >> _S29)
 
 
-@kernel
+@inline
 def find_or_add(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     level: int, words: Int32Array, base: int,
 ) -> Any:  # fmt: skip
     """The node at `level` with children (or payload halves) words[base:]; -1 if there is no room.
 
-    Kernels pass an int64 `level`: each other type would be compiled anew.
+    It becomes part of each kernel that calls it: a call would count references to five arrays.
     """
     d = arity[level]
     if level < len(arity) - 1:
@@ -103,7 +103,15 @@ def find_or_add(
     return n
 
 
-@kernel
+@lean_kernel
+def add_node(
+    pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, level: int, words: Int32Array
+) -> int:  # fmt: skip
+    """`find_or_add` for callers in Python."""
+    return int64(find_or_add(pool, head, unique, arity, level, words, 0))
+
+
+@lean_kernel
 def rehash(pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array) -> None:
     """Fill the empty table `unique` with every node of the pool."""
     mask = len(unique) - 1
@@ -145,7 +153,7 @@ def payload(pool: Int32Array, leaf: int) -> np.uint64:
     return low | (np.uint64(np.uint32(pool[leaf + 3])) << _S32)
 
 
-@kernel
+@lean_kernel
 def compact(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     roots: Int32Array, stack: Int32Array,
@@ -216,7 +224,7 @@ def compact(
     rehash(pool, head, unique, arity)
 
 
-@kernel
+@lean_kernel
 def insert_all(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     levels: Int32Array, first: Int64Array, children: Int32Array,

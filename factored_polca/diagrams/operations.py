@@ -20,7 +20,7 @@ from factored_polca.diagrams.diagram import Diagram
 from factored_polca.diagrams.field import Field
 from factored_polca.diagrams.leaves import FLOAT, INDEX, FloatLeaves, LeafType, payloads
 from factored_polca.diagrams.manager import Manager, require
-from factored_polca.diagrams.nodes import STEPS, Int32Array, find_or_add
+from factored_polca.diagrams.nodes import STEPS, Int32Array, add_node
 from factored_polca.diagrams.operators import OPERATORS, Kind, OperatorRow
 from factored_polca.diagrams.walk import collect, rebuild
 from factored_polca.diagrams.weighted import run_weighted_sum
@@ -41,7 +41,7 @@ def node(manager: Manager, level: int, children: Sequence[Diagram]) -> Diagram:
     words = np.array([child.node for child in children], dtype=np.int32)
     made = -1
     while made < 0:
-        made = find_or_add(manager.pool, manager.head, manager.unique, manager.arity, level, words, 0)
+        made = add_node(manager.pool, manager.head, manager.unique, manager.arity, level, words)
         if made < 0:
             manager.grow()
     return manager.handle(made, children[0].leaf_type)
@@ -78,10 +78,18 @@ def apply(name: str, a: Diagram, b: Diagram) -> Diagram:
     manager.safe_point()
     result_type = INDEX if row.gives == "boolean" else a.leaf_type
     field = a.leaf_type.parameters if isinstance(a.leaf_type, Field) else _NO_FIELD
-    op = manager.operator_rows.get((name, a.leaf_type))
-    if op is None:
-        op = manager.operator_rows[name, a.leaf_type] = _kernel_row(manager, row, a.leaf_type, result_type)
+    op = operator_row(manager, name, row, a.leaf_type, result_type)
     return manager.handle(_run_binary(manager, op, field, a, b), result_type)
+
+
+def operator_row(
+    manager: Manager, name: str, row: OperatorRow, leaf_type: LeafType, result_type: LeafType
+) -> npt.NDArray[np.int64]:
+    """The operator as `apply_binary` takes it, until the next collection."""
+    op = manager.operator_rows.get((name, leaf_type))
+    if op is None:
+        op = manager.operator_rows[name, leaf_type] = _kernel_row(manager, row, leaf_type, result_type)
+    return op
 
 
 def _kernel_row(
@@ -389,7 +397,7 @@ def weighted_sum(
     for v, (weight, term) in enumerate(zip(weights, terms, strict=True)):
         buffer[2 * v] = weight.node
         buffer[2 * v + 1] = term.node
-    manager.stack[:4] = (0, len(weights), -1, 0)
+    manager.stack[:5] = (0, len(weights), -1, 0, normalised)
     state = np.array([1, 0, STEPS], dtype=np.int64)
 
     def step() -> int:

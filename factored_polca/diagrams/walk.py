@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams.field import field_add, field_multiply
-from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.diagrams.jit import int64, kernel, lean_kernel
 from factored_polca.diagrams.nodes import DONE, FULL, Int32Array, Int64Array, find_or_add
 
 UInt64Array = npt.NDArray[np.uint64]
 
 
-@kernel
+@lean_kernel
 def collect(pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, stack: Int32Array) -> int:
     """Write the nodes under `root` to `nodes`, children first; answer how many."""
     leaf_level = len(arity) - 1
@@ -46,7 +46,7 @@ def collect(pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, s
     return count
 
 
-@kernel
+@lean_kernel
 def rebuild(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     nodes: Int32Array, changed: Int64Array, fixed: Int32Array, level_map: Int32Array,
@@ -74,7 +74,7 @@ def rebuild(
     return DONE
 
 
-@kernel
+@lean_kernel
 def evaluate(
     pool: Int32Array, arity: Int32Array, root: int, states: Int32Array, columns: Int32Array,
     out: Int32Array,
@@ -141,7 +141,7 @@ def first_states(
     return found
 
 
-@kernel
+@lean_kernel
 def count_states(
     pool: Int32Array, arity: Int32Array, nodes: Int32Array, count: int,
     above: UInt64Array, above_inverse: UInt64Array, prime: np.uint64, inverse: np.uint64,

@@ -5,7 +5,12 @@ the term stack.  Terms whose weight is the constant 0 are dropped; where the wei
 sum to 1 (a conditional distribution) and all r_j are one diagram, that diagram is the sum.  So
 deterministic effects and persistence cost no arithmetic at all.
 
-    frame   [base, terms, level, next child, result base]
+Terms with r_j = 0 are dropped too, so that a sum costs what its non-zero terms cost.  The weights of those
+that stay need not sum to 1, which the frames below are told.  Where two or more stay that all have one r_j,
+zeros stay with them, unless these are many: further down there may be branches on which only that r_j has
+weight.
+
+    frame   [base, terms, level, next child, whether the weights sum to 1]
 
 Results are remembered by their terms in a lossy cache: a slot holds a position in a ring of words
 where the key (m, mark, c_1, r_1, ..., c_m, r_m) was written; it is valid until the ring has come
@@ -29,7 +34,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams.apply import cache_index, float_payload
 from factored_polca.diagrams.field import field_add, field_multiply
-from factored_polca.diagrams.jit import inline, int64, kernel
+from factored_polca.diagrams.jit import inline, int64, lean_kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
@@ -104,34 +109,53 @@ def ring_insert(
 def settle(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     options: Int64Array, field: npt.NDArray[np.uint64], terms: Int32Array, base: int, count: int,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Drop zero terms of a list; answer (result or 0 or -1 for full, terms kept, top level)."""
+    normalised: int,
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Drop zero terms of a list.
+
+    Answers (result or 0 or -1 for full, terms kept, top level, whether the weights kept sum to 1).
+    """
     zero = options[ZERO]
     leaf_level = len(arity) - 1
     kept = 0
     top = leaf_level
     same = True
+    first = int64(0)
+    full = 0
     for j in range(count):
         c = int64(terms[base + 2 * j])
         if c == zero:
             continue
         r = int64(terms[base + 2 * j + 1])
-        if options[NORMALISED] == 0 and r == zero:
-            continue
+        if r != zero:
+            full += 1
+            if first == 0:
+                first = r
+            elif r != first:
+                same = False
         terms[base + 2 * kept] = c
         terms[base + 2 * kept + 1] = r
-        if r != terms[base + 1]:
-            same = False
-        top = min(top, min(pool[c], pool[r]))
         kept += 1
-    if kept == 0:
-        return zero, kept, top
-    if options[NORMALISED] != 0 and same:
-        return int64(terms[base + 1]), kept, top
+    if full == 0:
+        return zero, kept, top, normalised
+    if normalised != 0 and same and full == kept:
+        return first, kept, top, normalised
+    if full < kept and (normalised == 0 or not same or full == 1 or 2 * full < kept):
+        normalised = int64(0)
+        listed = kept
+        kept = 0
+        for j in range(listed):
+            if terms[base + 2 * j + 1] == zero:
+                continue
+            terms[base + 2 * kept] = terms[base + 2 * j]
+            terms[base + 2 * kept + 1] = terms[base + 2 * j + 1]
+            kept += 1
     if kept == 1 and terms[base] == options[ONE]:
-        return int64(terms[base + 1]), kept, top
+        return int64(terms[base + 1]), kept, top, normalised
+    for j in range(kept):
+        top = min(top, min(pool[terms[base + 2 * j]], pool[terms[base + 2 * j + 1]]))
     if top < leaf_level:
-        return int64(0), kept, top
+        return int64(0), kept, top, normalised
     value = np.uint64(0)
     if options[IS_FLOAT] != 0:
         total = 0.0
@@ -151,10 +175,10 @@ def settle(
     free = base + 2 * count
     terms[free] = np.int32(value & _LOW)
     terms[free + 1] = np.int32(value >> _S32)
-    return find_or_add(pool, head, unique, arity, leaf_level, terms, free), kept, top
+    return find_or_add(pool, head, unique, arity, leaf_level, terms, free), kept, top, normalised
 
 
-@kernel
+@lean_kernel
 def run_weighted_sum(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
@@ -163,9 +187,10 @@ def run_weighted_sum(
 ) -> int:  # fmt: skip
     """Sum the terms of the frames in `stack`.
 
-    `state` is [frames, results, budget]; the caller puts one frame of level -1 with the terms.
+    `state` is [frames, results, budget]; the caller puts one frame of level -1 with the terms, its last
+    word `options[NORMALISED]`.
     """
-    mark = options[MARK]
+    mark = options[MARK] - options[NORMALISED]
     sp = state[0]
     rp = state[1]
     budget = state[2]
@@ -192,7 +217,7 @@ def run_weighted_sum(
                 state[1] = rp
                 state[2] = budget
                 return FULL
-            ring_insert(slots, ring, ring_state, terms, base, count, mark, r)
+            ring_insert(slots, ring, ring_state, terms, base, count, mark + stack[f + 4], r)
             rp -= arity[level]
             results[rp] = r
             rp += 1
@@ -204,20 +229,23 @@ def run_weighted_sum(
             if level >= 0 and pool[node] == level:
                 node = int64(pool[node + 2 + k])
             terms[new + j] = node
-        r, kept, top = settle(pool, head, unique, arity, options, field, terms, new, count)
+        r, kept, top, normalised = settle(
+            pool, head, unique, arity, options, field, terms, new, count, int64(stack[f + 4])
+        )
         if r < 0:
             state[0] = sp
             state[1] = rp
             state[2] = budget
             return FULL
         if r == 0:
-            r = ring_lookup(slots, ring, ring_state, terms, new, kept, mark)
+            r = ring_lookup(slots, ring, ring_state, terms, new, kept, mark + normalised)
         stack[f + 3] = k + 1
         if r == 0:
             stack[f + 5] = new
             stack[f + 6] = kept
             stack[f + 7] = top
             stack[f + 8] = 0
+            stack[f + 9] = normalised
             sp += 1
             continue
         results[rp] = r
@@ -228,7 +256,42 @@ def run_weighted_sum(
     return DONE
 
 
-@kernel
+@lean_kernel
+def collect_possible(
+    pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, stack: Int32Array,
+    weights: Int32Array, first_weight: Int64Array, last_changed: int, zero: int,
+) -> int:  # fmt: skip
+    """As `walk.collect`, without nodes to which only impossible values lead, those whose weight is 0
+    everywhere, and with none at all, answer 0, if then every leaf is 0."""
+    count = 0
+    some = False
+    stack[0] = root
+    stack[1] = 0
+    sp = 1
+    while sp > 0:
+        node = int64(stack[2 * sp - 2])
+        k = stack[2 * sp - 1]
+        level = pool[node]
+        if level <= last_changed and k < arity[level]:
+            stack[2 * sp - 1] = k + 1
+            if weights[first_weight[level] + k] == zero:
+                continue
+            child = int64(pool[node + 2 + k])
+            number = int64(pool[child + 1])
+            if number < 0 or number >= count or nodes[number] != child:
+                stack[2 * sp] = child
+                stack[2 * sp + 1] = 0
+                sp += 1
+            continue
+        some = some or (level > last_changed and node != zero)
+        pool[node + 1] = count
+        nodes[count] = node
+        count += 1
+        sp -= 1
+    return count if some else 0
+
+
+@lean_kernel
 def run_regression(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array,
@@ -237,12 +300,14 @@ def run_regression(
     cache: Int32Array, key: int, nodes: Int32Array, count: int, weights: Int32Array,
     first_weight: Int64Array, last_changed: int, regressed: Int32Array, progress: Int64Array,
 ) -> int:  # fmt: skip
-    """Regress the `count` nodes in `nodes` (children first, numbered in their scratch words).
+    """Regress the `count` nodes in `nodes` (children first, numbered in their scratch words; those that
+    no possible value leads to may be missing, see `collect_possible`).
 
     `weights[first_weight[i] + v]` is the diagram of P(x_i' = v | x).  `progress` is
     [next node, 1 if a sum is under way]; `cache` remembers regressions under `key` between calls.
     """
     mask = (len(cache) >> 2) - 1
+    zero = np.int32(options[ZERO])
     while progress[0] < count:
         node = int64(nodes[progress[0]])
         level = pool[node]
@@ -258,12 +323,16 @@ def run_regression(
                 continue
             d = arity[level]
             for v in range(d):
-                terms[2 * v] = weights[first_weight[level] + v]
-                terms[2 * v + 1] = regressed[pool[pool[node + 2 + v] + 1]]
+                weight = weights[first_weight[level] + v]
+                terms[2 * v] = weight
+                terms[2 * v + 1] = zero
+                if weight != zero:
+                    terms[2 * v + 1] = regressed[pool[pool[node + 2 + v] + 1]]
             stack[0] = 0
             stack[1] = d
             stack[2] = -1
             stack[3] = 0
+            stack[4] = options[NORMALISED]
             state[0] = 1
             state[1] = 0
             progress[1] = 1

@@ -32,9 +32,9 @@ form of the joint row over (block, observation): Eq. 13.  Observed features are 
 Where actions are interchangeable (`factored_polca.minimisation.interchangeable`) steps 0 and 1 compare the
 multiset of the choices' signatures instead of choice with choice.
 
-A block that is not split keeps its r_k (of a block that is, one part does), so that most of V, and
-with it most cached regressions, survive from pass to pass; and a choice whose f_c is the diagram it
-was before needs no pairing.
+Only the first pass of a field regresses V as a whole.  A block that is not split keeps its r_k, and of one
+that is one part does; regression is linear, so later passes regress the change of V alone
+(`factored_polca.minimisation.pass_kernel`).  With interchangeable choices every pass is a whole one.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ from factored_polca.minimisation.criterion import (
 )
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
+from factored_polca.minimisation.propagation import UNLIMITED, Propagation, TooManyBlocks
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
@@ -181,23 +182,27 @@ class _Refinement:
         self.attempts = 0
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
-        self.previous: dict[int, Diagram] = {}
+        self.propagation: Propagation | None = None
         self.denominator = common_denominator(process)
         self.use(Field() if self.denominator % MERSENNE_61 else Field(self.fresh_prime()))
 
     @property
     def blocks(self) -> int:
         """The blocks so far; the class of states outside a restriction is none."""
+        return max(1, self.labels.blocks - self.has_outside)
+
+    @property
+    def has_outside(self) -> bool:
+        """Whether there are states outside a restriction."""
         reachable = self.process.reachable
-        has_outside = reachable is not None and not reachable.is_constant
-        return max(1, self.labels.blocks - has_outside)
+        return reachable is not None and not reachable.is_constant
 
     def use(self, field: Field) -> None:
         """Go on in another field, with fresh draws; start from the present partition."""
         self.field = field
         self.primes.append(field.prime)
         self.view = self.new_view(field)
-        self.previous.clear()
+        self.propagation = None
         self.labels.elements = field.draw(self.generator, self.labels.blocks)
         if self.interchangeable:
             self.polynomial = Polynomial(self.view, field, self.generator)
@@ -270,35 +275,62 @@ class _Refinement:
                 self.split(choose(live, variable, self.manager.constant(0)))
 
     def refine(self) -> None:
-        while self.one_pass():
-            pass
+        """Passes until nothing changes."""
+        if self.interchangeable:
+            while self.one_pass():
+                pass
+            return
+        self.propagate(UNLIMITED)
 
     def one_pass(self) -> bool:
         """Refine by every choice; answer whether a block was split."""
+        if not self.interchangeable:
+            return self.propagate(1)
         before = self.labels.blocks
-        memo: dict[int, Diagram] = {}
         value = relabel(self.labels.diagram, self.labels.elements, self.field)
-        try:
-            self.split_all(value, memo)
-        except Vanished:  # with a chance of some 1/p for each state
-            self.use(self.field)
-            return True
+        self.split(self.polynomial.of_rows(value, {}))
         self.rounds += 1
-        if self.progress is not None:
-            self.progress(self.rounds, self.blocks)
+        self.report(self.rounds, self.labels.blocks)
         return self.labels.blocks > before
 
-    def split_all(self, value: Diagram, memo: dict[int, Diagram]) -> None:
-        """Refine by the regression of `value` through every choice."""
-        if self.interchangeable:
-            self.split(self.polynomial.of_rows(value, memo))
-            return
-        for number, choice in enumerate(self.process.choices):
-            regressed = self.view.regress(choice, value, memo)
-            if self.previous.get(number) == regressed:
-                continue
-            self.previous[number] = regressed
-            self.split(regressed)
+    def propagate(self, passes: int) -> bool:
+        """Up to so many passes over the choices; answer whether a block was split."""
+        if self.propagation is None:
+            self.propagation = self.new_propagation()
+        propagation, done = self.propagation, self.propagation.passes
+        try:
+            return propagation.run(passes)
+        except Vanished:  # with a chance of some 1/p for each state
+            self.keep(propagation)
+            self.use(self.field)
+            return True
+        except TooManyBlocks:
+            self.keep(propagation)
+            self.check_limit()
+            raise
+        finally:
+            self.keep(propagation)
+            self.rounds += propagation.passes - done
+            self.report(self.rounds, propagation.blocks)
+
+    def new_propagation(self) -> Propagation:
+        """The present partition as the start of passes in the present field."""
+        outside = self.labels.blocks - self.blocks
+        return Propagation(
+            self.view, self.labels.diagram, self.labels.elements,
+            lambda count: self.field.draw(self.generator, count),
+            allowed=None if self.block_limit is None else self.block_limit + outside,
+            look=lambda passes, blocks: self.report(self.rounds + passes, blocks),
+        )  # fmt: skip
+
+    def keep(self, propagation: Propagation) -> None:
+        """The partition that it has come to."""
+        self.labels = _Labels(propagation.labels, propagation.elements[: propagation.blocks])
+
+    def report(self, rounds: int, labels: int) -> None:
+        """Tell the progress."""
+        if self.progress is not None:
+            self.progress(rounds, max(1, labels - self.has_outside))
 
     def split(self, by: Diagram) -> None:
         """Replace the partition by the distinct pairs (block, leaf of `by`)."""
@@ -315,6 +347,14 @@ class _Refinement:
         fresh[first] = False
         elements[fresh] = self.draw_new(int(fresh.sum()), elements[first])
         self.labels = _Labels(numbered, elements)
+        self.check_limit()
+
+    def check_limit(self) -> None:
+        """Stop where there are too many blocks.
+
+        Raises:
+            LimitReached: there are.
+        """
         if self.block_limit is not None and self.blocks > self.block_limit:
             raise LimitReached(
                 f"more than {self.block_limit:,} blocks after {self.rounds} rounds",
@@ -338,7 +378,7 @@ class _Refinement:
         """The partition when a limit has been reached; None where even that takes more memory."""
         deadline, self.manager.deadline = self.manager.deadline, None
         try:
-            self.previous.clear()
+            self.propagation = None
             self.manager.collect_garbage()
             return self.partition()
         except MemoryLimit:

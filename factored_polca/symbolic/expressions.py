@@ -82,6 +82,7 @@ class ExpressionCompiler:
         self.parameters = parameters
         self.table = ValueTable()
         self._memo: dict[Expression, Diagram] = {}
+        self._folds: dict[tuple[str, int, int], Diagram] = {}
 
     def compile(self, expression: Expression) -> Diagram:
         """The diagram of `expression`; its leaves number entries of `table`."""
@@ -141,10 +142,19 @@ class ExpressionCompiler:
         raise TypeError(f"{type(e).__name__} is no expression")
 
     def _fold(self, name: str, arguments: Sequence[Diagram]) -> Diagram:
-        """An associative operator, two arguments at a time from the left."""
+        """An associative operator, two arguments at a time from the left.
+
+        Conditions that begin alike share what they begin with; long sums would keep too much alive.
+        """
         result = arguments[0]
         for argument in arguments[1:]:
-            result = self.map([result, argument], lambda a, b: _operate(name, (a, b)))
+            key = (name, id(result), id(argument))  # `_memo` and `_folds` keep both alive
+            known = self._folds.get(key)
+            if known is None:
+                known = self.map([result, argument], lambda a, b: _operate(name, (a, b)))
+                if name in ("and", "or"):
+                    self._folds[key] = known
+            result = known
         return result
 
     def _reference(self, reference: Reference) -> Diagram:

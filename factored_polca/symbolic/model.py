@@ -223,6 +223,7 @@ class _Build:
         self.manager, self.compiler = manager, compiler
         self.faults: list[Fault] = []
         self.suspects: list[tuple[Variable, Diagram, Diagram, tuple[str, ...]]] = []
+        self.known_rows: dict[tuple[tuple[object, ...], Expression], RowDiagram] = {}
         self.false, self.true = manager.constant(0), manager.constant(1)
 
     @classmethod
@@ -306,6 +307,10 @@ class _Build:
 
         Where it is none it becomes a suspect: see `settle_suspects`.
         """
+        key = (variable.values, given)
+        if key in self.known_rows:  # the effect of another action, and no suspect
+            known = self.known_rows[key]
+            return RowDiagram(index, known.diagram, known.rows, known.parents_next)
         compiled = self.compiler.compile(given)
         fallback = tuple(Fraction(int(v == 0)) for v in range(len(variable.values)))
         numbers: dict[Row, int] = {}
@@ -323,7 +328,10 @@ class _Build:
                 self.suspects.append((variable, compiled, wrong, path))
         primed = {r.name for r in references(given) if r.primed}
         parents = tuple(i for i, f in enumerate(self.model.features) if f.name in primed)
-        return RowDiagram(index, relabel(compiled, images, INDEX), tuple(numbers), parents)
+        row_diagram = RowDiagram(index, relabel(compiled, images, INDEX), tuple(numbers), parents)
+        if not bad.any():
+            self.known_rows[key] = row_diagram
+        return row_diagram
 
     def settle_suspects(self, rows: dict[int, RowDiagram]) -> None:
         """Report the rows that are wrong where next values of positive probability lead."""

@@ -78,9 +78,9 @@ class NumericView:
 
     def weights(self, action: int, feature: int) -> list[Diagram]:
         """P_a(x_i' = v | parents) for each v."""
-        key = (action, feature)
+        row = self.symbolic.actions[action].rows.get(feature)
+        key = (-1, feature) if row is None else (id(row.diagram), id(row.rows))  # actions share them
         if key not in self._weights:
-            row = self.symbolic.actions[action].rows.get(feature)
             if row is None:
                 level = self.symbolic.now(feature)
                 size = len(self.symbolic.model.features[feature].values)
@@ -102,7 +102,7 @@ class NumericView:
             return value
         if compiled.synchronic:
             return self.expect(action, self.shift(value))
-        return self.regress_nodes(self._prepare(action), value)
+        return self.regress_nodes(self.prepared(action), value)
 
     def shift(self, value: Diagram) -> Diagram:
         """V over the next variables in place of the present ones."""
@@ -135,7 +135,8 @@ class NumericView:
         key = self.manager.cache_key("regression", name, self.leaf_type)
         return Prepared(handles, first, last, key)
 
-    def _prepare(self, action: int) -> Prepared:
+    def prepared(self, action: int) -> Prepared:
+        """The regression through an action without synchronic arcs."""
         if action not in self._prepared:
             features = range(len(self.symbolic.model.features))
             self._prepared[action] = self.prepare(
