@@ -195,8 +195,11 @@ def test_argmax_names_the_first_largest_candidate(sizes: Sizes) -> None:
 def test_a_weighted_sum_in_a_field_is_the_sum_of_products(sizes: Sizes) -> None:
     for manager, random in cases(sizes):
         for count in (1, 2, 3, 9):
-            weights = [drawn(manager, random, FIELD) for _ in range(count)]
-            terms = [drawn(manager, random, FIELD) for _ in range(count)]
+            weights = [drawn(manager, random, FIELD, [0, 1, P - 2]) for _ in range(count)]
+            terms = [drawn(manager, random, FIELD, [0, 0, 0, 5, P - 1]) for _ in range(count)]
+            if count == 3:
+                weights = [drawn(manager, random, FIELD) for _ in range(count)]
+                terms = [drawn(manager, random, FIELD) for _ in range(count)]
 
             def total(s: tuple[int, ...], w: Any = weights, t: Any = terms) -> int:
                 return sum(a[s] * b[s] for (a, _), (b, _) in zip(w, t, strict=True)) % P

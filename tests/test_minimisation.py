@@ -15,7 +15,7 @@ import pytest
 from compiled_cases import MODELS, Case, case, chunks, compiled
 from random_models import add_irrelevant_feature, relabel, reorder
 
-from factored_polca.diagrams import INDEX, MERSENNE_61
+from factored_polca.diagrams import INDEX, MERSENNE_61, Diagram
 from factored_polca.explicit.dynamic_programming import action_values, evaluate_policy
 from factored_polca.explicit.exact_dynamic_programming import optimal_solution
 from factored_polca.explicit.minimiser import minimise as explicit_minimise
@@ -28,10 +28,13 @@ from factored_polca.minimisation import (
     Reduction,
     flat_process,
     minimise,
+    propagation,
     reduce,
+    refine,
 )
 from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.minimisation.quotient import exact_initial_distribution
+from factored_polca.minimisation.race import Race
 from factored_polca.minimisation.refine import difference_bits
 from factored_polca.models import (
     Action,
@@ -44,7 +47,8 @@ from factored_polca.models import (
     lottery,
 )
 from factored_polca.solvers.choose import solve_mdp
-from factored_polca.symbolic import compile_model, reachable_states
+from factored_polca.symbolic import NumericView, compile_model, reachable_states
+from factored_polca.symbolic.forward import looks_up
 
 FEWER = MODELS // 3
 """Seeds for variations whose main statement all models have been tested for."""
@@ -79,6 +83,40 @@ def test_the_partition_is_the_one_that_brute_force_finds(seeds: range) -> None:
         assert partition.sizes == [len(blocks[k]) for k in range(partition.blocks)]
         assert sum(partition.sizes) == found.model.states
         assert 0 < result.minimisation.collision_bound < 1e-10
+
+
+class Downwards(Race):
+    """Regresses from the top down wherever it can."""
+
+    def regress(self, numbers: NumericView, primitive: int, value: Diagram) -> Diagram | None:
+        self.ways.setdefault(primitive, "down" if looks_up(numbers, primitive) else "up")
+        return super().regress(numbers, primitive, value)
+
+
+@chunks()
+def test_passes_over_what_has_changed_find_the_same_partition(
+    seeds: range, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without passes that begin anew, and with whole passes regressed from the top down."""
+    monkeypatch.setattr(refine, "EARLY", 0)
+    monkeypatch.setattr(refine, "Race", Downwards)
+    monkeypatch.setattr(propagation, "LARGE", 0)
+    for seed in seeds:
+        found = case(seed)
+        again = minimise(flat_process(found.symbolic), seed=seed + 1)
+        assert again.partition.diagram == reduction(seed).partition.diagram, seed
+        assert same_blocks(found, again.partition, explicit_minimise(found.exact).members()), seed
+
+
+def test_a_chain_is_split_state_by_state() -> None:
+    """x counts up to where it is paid, so each state is a block, found in one pass each from the end."""
+    x, lamp = Feature("x", range(40)), boolean("lamp")
+    up = Action("up", {x: "min(x + 1, 39)", lamp: lottery({True: Fraction(1, 2), False: Fraction(1, 2)})})
+    symbolic = compile_model(Model("chain", [x, lamp], [up], rewards="1 if x == 39 else 0"))
+    found = minimise(flat_process(symbolic))
+    assert found.partition.blocks == 40
+    assert found.partition.sizes == [2] * 40
+    assert found.rounds > 36
 
 
 @chunks()

@@ -20,6 +20,8 @@ int64: Callable[[Any], int] = cast(Callable[[Any], int], np.int64)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_njit: Any = numba.njit  # its types know no `_nrt`
+
 KERNELS: list[Any] = []
 """Every compiled function of the package, in order of definition."""
 
@@ -37,14 +39,14 @@ def lean_kernel(function: Function) -> Function:
     It counts no references to the arrays that it passes on, which took a fifth of the time where small
     kernels are called for every node.
     """
-    compiled = numba.njit(cache=True, error_model="numpy", _nrt=False)(function)
+    compiled = _njit(cache=True, error_model="numpy", _nrt=False)(function)
     KERNELS.append(compiled)
     return cast(Function, compiled)
 
 
 def inline(function: Function) -> Function:
     """Compile `function`, which makes no arrays, into each kernel that calls it."""
-    return cast(Function, numba.njit(forceinline=True, error_model="numpy", _nrt=False)(function))
+    return cast(Function, _njit(forceinline=True, error_model="numpy", _nrt=False)(function))
 
 
 def compiled_before() -> bool:

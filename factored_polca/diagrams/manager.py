@@ -83,6 +83,8 @@ class Manager:
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0
+        self._made = 0
+        self._counted = 0
         self._abort = False
         self._undisturbed = False
         self._fields: dict[int, int] = {}
@@ -250,7 +252,9 @@ class Manager:
         self.slots[:] = 0
         self.ring_state[0] = 0
         stack = np.empty(2 * self.leaf_level + 4, np.int32)
+        self._made = self.nodes_made
         compact(self.pool, self.head, self.unique, self.arity, self.roots, stack)
+        self._counted = int(self.head[1])
         self._live = int(self.head[0])
         self._plan_collection()
 
@@ -309,6 +313,11 @@ class Manager:
     def node_count(self) -> int:
         """Nodes in the store, garbage included."""
         return int(self.head[1])
+
+    @property
+    def nodes_made(self) -> int:
+        """How many nodes were ever made."""
+        return self._made + int(self.head[1]) - self._counted
 
     def _note_peak(self) -> None:
         self.peak_nodes = max(self.peak_nodes, int(self.head[1]))

@@ -119,10 +119,7 @@ class ProcessView:
 
     def _primitive_reward(self, primitive: int) -> Diagram:
         if primitive not in self._rewards:
-            total = self.numbers.zero
-            for term in self.process.rewards[primitive]:
-                total = total + self.numbers.term(term)
-            self._rewards[primitive] = total
+            self._rewards[primitive] = self.numbers.total(self.process.rewards[primitive])
         return self._rewards[primitive]
 
     def select(self, choice: Choice, parts: dict[int, Diagram]) -> Diagram:

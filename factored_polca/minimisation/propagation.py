@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import INDEX, Diagram, Field, choose, relabel
+from factored_polca.diagrams import INDEX, Diagram, Field, choose, node_count, relabel
 from factored_polca.diagrams.apply import (
     CODE,
     KEY,
@@ -26,6 +26,7 @@ from factored_polca.diagrams.operations import Walk, operator_row, sum_options
 from factored_polca.diagrams.operators import OPERATORS
 from factored_polca.minimisation.criterion import Choice, ProcessView
 from factored_polca.minimisation.pass_kernel import BEYOND, PAUSE, run_passes
+from factored_polca.minimisation.race import Race
 from factored_polca.minimisation.split_kernel import (
     BLOCKS,
     DIFFERENCE,
@@ -42,6 +43,9 @@ UInt64Array = npt.NDArray[np.uint64]
 
 UNLIMITED = 2**62
 
+LARGE = 200
+"""Nodes of V from which on it matters how it is regressed."""
+
 
 class TooManyBlocks(RuntimeError):
     """The blocks are more than allowed."""
@@ -57,6 +61,7 @@ class Propagation:
         draw: makes so many random elements, in stored form.
         allowed: stop beyond so many blocks.
         look: called now and then with the passes so far and the blocks.
+        race: tells how to regress all of V, in the first pass.
     """
 
     def __init__(
@@ -68,11 +73,12 @@ class Propagation:
         *,
         allowed: int | None = None,
         look: Callable[[int, int], None] | None = None,
+        race: Race | None = None,
     ) -> None:
         field = view.numbers.leaf_type
         assert isinstance(field, Field)
         self.view, self.field, self.draw, self.look = view, field, draw, look
-        self.manager = view.numbers.manager
+        self.manager, self.race = view.numbers.manager, race
         self.zero, self.one = view.numbers.zero, view.numbers.one
         self.choices: Sequence[Choice] = view.process.choices
         self.numbers = np.array([len(elements), 0, 0, allowed or UNLIMITED, 0], dtype=np.int64)
@@ -249,7 +255,7 @@ class Propagation:
             while self.passes < end and self.live[DIFFERENCE] != self.zero.node:
                 self._collect_if_due()
                 self._regress_others()
-                self._run_until(self.passes + 1 if self.others else end)
+                self._run_until(self.passes + 1 if self.others or self.regressed_handles else end)
         finally:
             self._hold()
         return self.blocks > before
@@ -263,18 +269,32 @@ class Propagation:
     def _regress_others(self) -> None:
         """R_p[D] for the primitives that the kernel does not regress."""
         self.regressed_handles = {}
-        if not self.others:
+        racing = self._racing()
+        if not self.others and not racing:
             return
         self._hold()
-        regress = self.view.numbers.regress if self.view.sensed is None else self.view.sensed.regress
+        difference, numbers = self.handles[DIFFERENCE], self.view.numbers
+        regress = numbers.regress if self.view.sensed is None else self.view.sensed.regress
         try:
             for number in self.others:
-                result = regress(self.primitives[number], self.handles[DIFFERENCE])
-                self.regressed_handles[number] = result
+                self.regressed_handles[number] = regress(self.primitives[number], difference)
+            for number in racing:
+                assert self.race is not None
+                result = self.race.regress(numbers, self.primitives[number], difference)
+                if result is not None:
+                    self.regressed_handles[number] = result
         finally:
             self._refresh()
         for number, handle in self.regressed_handles.items():
             self.regressed[number] = handle.node
+
+    def _racing(self) -> list[int]:
+        """The primitives for which it matters how V is regressed: in the first pass, where V is large."""
+        if self.race is None or self.passes > 0 or self.view.sensed is not None:
+            return []
+        if node_count(self.handles[DIFFERENCE]) < LARGE:
+            return []
+        return [n for n in range(len(self.primitives)) if self.last_changed[n] >= 0]
 
     def _run_until(self, end: int) -> None:
         """The kernel, until `end` passes are done or nothing changes any more."""

@@ -54,6 +54,7 @@ from factored_polca.diagrams import (
     Field,
     MemoryLimit,
     choose,
+    node_count,
     pairs,
     random_prime,
     relabel,
@@ -69,7 +70,8 @@ from factored_polca.minimisation.criterion import (
 )
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
-from factored_polca.minimisation.propagation import UNLIMITED, Propagation, TooManyBlocks
+from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagation, TooManyBlocks
+from factored_polca.minimisation.race import Race
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
@@ -183,6 +185,7 @@ class _Refinement:
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | None = None
+        self.race = Race()
         self.denominator = common_denominator(process)
         self.use(Field() if self.denominator % MERSENNE_61 else Field(self.fresh_prime()))
 
@@ -288,7 +291,13 @@ class _Refinement:
             return self.propagate(1)
         before = self.labels.blocks
         value = relabel(self.labels.diagram, self.labels.elements, self.field)
-        self.split(self.polynomial.of_rows(value, {}))
+        memo: dict[int, Diagram] = {}
+        if node_count(value) >= LARGE:
+            for primitive in {p for choice in self.process.choices for p in choice.primitives}:
+                result = self.race.regress(self.view.numbers, primitive, value)
+                if result is not None:
+                    memo[primitive] = result
+        self.split(self.polynomial.of_rows(value, memo))
         self.rounds += 1
         self.report(self.rounds, self.labels.blocks)
         return self.labels.blocks > before
@@ -320,7 +329,7 @@ class _Refinement:
             self.view, self.labels.diagram, self.labels.elements,
             lambda count: self.field.draw(self.generator, count),
             allowed=None if self.block_limit is None else self.block_limit + outside,
-            look=lambda passes, blocks: self.report(self.rounds + passes, blocks),
+            look=lambda passes, blocks: self.report(self.rounds + passes, blocks), race=self.race,
         )  # fmt: skip
 
     def keep(self, propagation: Propagation) -> None:

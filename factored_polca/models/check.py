@@ -51,6 +51,7 @@ class _Context:
         default_factory=dict
     )  # features whose next value is mentioned
     sound: dict[tuple[bool, bool, bool], set[int]] = field(default_factory=dict)
+    effects: set[Expression] = field(default_factory=set)  # without faults
 
     def __post_init__(self) -> None:
         self.scope = self.model.scope()
@@ -196,9 +197,14 @@ def _check_action(context: _Context, action: Action) -> Iterator[Fault]:
         if count > 1:
             yield Fault(f"{count} effects on {name!r}", (*path, "effects", name))
     for name, effect in action.effects:
-        yield from _check_expression(
-            context, effect, (*path, "effects", name), primed=True, distribution=True
+        if effect in context.effects:  # other actions have it, too
+            continue
+        faults = list(
+            _check_expression(context, effect, (*path, "effects", name), primed=True, distribution=True)
         )
+        yield from faults
+        if not faults:
+            context.effects.add(effect)
     yield from _check_cycle(context, action, path)
     yield from _check_expression(context, action.applicable, (*path, "applicable"))
     if model.observability == "partial" and action.applicable != _TRUE:

@@ -224,6 +224,7 @@ class _Build:
         self.faults: list[Fault] = []
         self.suspects: list[tuple[Variable, Diagram, Diagram, tuple[str, ...]]] = []
         self.known_rows: dict[tuple[tuple[object, ...], Expression], RowDiagram] = {}
+        self.known_terms: dict[Expression, Term] = {}
         self.false, self.true = manager.constant(0), manager.constant(1)
 
     @classmethod
@@ -397,10 +398,18 @@ class _Build:
         observations: dict[int, RowDiagram],
     ) -> Term:
         """A reward term as a function of (x, x'), o in expectation; a condition counts as 0 or 1."""
+        if expression in self.known_terms:  # of another action, with no fault anywhere
+            return expect_observations(self, self.known_terms[expression], observations)
         compiled = self.compiler.compile(expression)
-        bad = np.array(
-            [not isinstance(v, (Fraction, bool)) for v in self.compiler.table.values], dtype=np.uint64
-        )
+        entries = used(compiled)
+        values = [self.compiler.value(entry) for entry in entries]
+        if all(isinstance(value, (Fraction, bool)) for value in values):
+            term = numbered(compiled, lambda n: as_number(self.compiler.value(n)))
+            self.known_terms[expression] = term
+            return expect_observations(self, term, observations)
+        bad = np.zeros(max(entries) + 1, dtype=np.uint64)
+        for entry, value in zip(entries, values, strict=True):
+            bad[entry] = not isinstance(value, (Fraction, bool))
         wrong = restrict_to_possible(self, relabel(compiled, bad, INDEX) & where, observations)
         wrong = self.happening(wrong, rows)
         if wrong != self.false:
@@ -410,10 +419,14 @@ class _Build:
 
     def expected(self, term: Term, rows: dict[int, RowDiagram], elimination: tuple[int, ...]) -> Term:
         """The expectation over x' of a term."""
+        tested = set(support(term.diagram))
+        if not any(level % 2 for level in tested if level < 2 * len(self.order)):
+            return term
         for index in elimination:
             level = 2 * self.positions[index] + 1
-            if level in support(term.diagram):
+            if level in tested:
                 term = self.expectation(term, index, level, rows.get(index))
+                tested = set(support(term.diagram))
         return term
 
     def expectation(self, term: Term, index: int, level: int, row: RowDiagram | None) -> Term:

@@ -36,6 +36,9 @@ from factored_polca.diagrams.weighted import run_regression
 from factored_polca.symbolic.model import SymbolicModel
 from factored_polca.symbolic.rows import Term
 
+SHARED_SUM = 128
+"""Terms up to which a sum's parts are kept: some n^3 / 6 nodes for n terms over a feature each."""
+
 
 @dataclass
 class Prepared:
@@ -63,6 +66,8 @@ class NumericView:
         self.zero = self.manager.constant(0, leaf_type)
         self.one = self.manager.constant(1, leaf_type)
         self._weights: dict[tuple[int, int], list[Diagram]] = {}
+        self._terms: dict[int, tuple[Term, Diagram]] = {}
+        self._sums: dict[tuple[int, int], tuple[Diagram, Diagram, Diagram]] = {}
         self._prepared: dict[int, Prepared] = {}
         self._options: tuple[int, npt.NDArray[np.int64]] | None = None
 
@@ -74,7 +79,24 @@ class NumericView:
 
     def term(self, term: Term) -> Diagram:
         """A term with its values as leaves."""
-        return relabel(term.diagram, self.stored(term.values), self.leaf_type)
+        key = id(term.diagram)  # actions share terms
+        if key not in self._terms:
+            self._terms[key] = (term, relabel(term.diagram, self.stored(term.values), self.leaf_type))
+        return self._terms[key][1]
+
+    def total(self, terms: Sequence[Term]) -> Diagram:
+        """The sum of some terms; short sums that begin alike share what they begin with."""
+        total = self.zero
+        for term in terms:
+            part = self.term(term)
+            if len(terms) > SHARED_SUM:
+                total = total + part
+                continue
+            path = (id(total), id(part))
+            if path not in self._sums:
+                self._sums[path] = (total, part, total + part)
+            total = self._sums[path][2]
+        return total
 
     def weights(self, action: int, feature: int) -> list[Diagram]:
         """P_a(x_i' = v | parents) for each v."""
@@ -146,32 +168,53 @@ class NumericView:
 
     def regress_nodes(self, prepared: Prepared, value: Diagram) -> Diagram:
         """The regression of V, over the present variables, with prepared weights, node by node."""
+        self.manager.safe_point()
+        regression = NodeRegression(self, prepared, value)
+        self.manager.run(regression.step)
+        return regression.result
+
+    def sum_options(self) -> npt.NDArray[np.int64]:
+        """The options of normalised weighted sums, until the next collection."""
+        if self._options is None or self._options[0] != self.manager.collections:
+            self._options = (self.manager.collections, sum_options(self.manager, self.leaf_type, True))
+        return self._options[1]
+
+
+class NodeRegression:
+    """A regression from the bottom up, in slices: call `step` until it answers DONE.
+
+    No garbage may be collected, and no other weighted sum run, before it is done.
+    """
+
+    def __init__(self, numbers: NumericView, prepared: Prepared, value: Diagram) -> None:
+        self.manager, self.leaf_type = numbers.manager, numbers.leaf_type
         manager = self.manager
-        manager.safe_point()
         if prepared.collections != manager.collections:
             prepared.nodes = np.array([handle.node for handle in prepared.handles], dtype=np.int32)
             prepared.collections = manager.collections
-        field_parameters = (
+        self.prepared = prepared
+        self.options = numbers.sum_options()
+        self.field = (
             self.leaf_type.parameters
             if isinstance(self.leaf_type, Field)
             else np.array([3, 1], dtype=np.uint64)
         )
-        if self._options is None or self._options[0] != manager.collections:
-            self._options = (manager.collections, sum_options(manager, self.leaf_type, True))
-        options = self._options[1]
-        walk = Walk(value)
-        regressed = np.empty(len(walk.nodes), dtype=np.int32)
-        progress = np.zeros(2, dtype=np.int64)
-        state = np.array([0, 0, STEPS], dtype=np.int64)
+        self.walk = Walk(value)
+        self.regressed = np.empty(len(self.walk.nodes), dtype=np.int32)
+        self.progress = np.zeros(2, dtype=np.int64)
+        self.state = np.array([0, 0, STEPS], dtype=np.int64)
 
-        def step() -> int:
-            m = manager
-            return run_regression(
-                m.pool, m.head, m.unique, m.arity, m.slots, m.ring, m.ring_state, options,
-                field_parameters, m.stack, m.terms, m.results, state, m.cache, prepared.key,
-                walk.nodes, len(walk.nodes), prepared.nodes, prepared.first, prepared.last_changed,
-                regressed, progress,
-            )  # fmt: skip
+    def step(self) -> int:
+        """One slice; what a resumable kernel answers."""
+        m, walk, prepared = self.manager, self.walk, self.prepared
+        return run_regression(
+            m.pool, m.head, m.unique, m.arity, m.slots, m.ring, m.ring_state, self.options,
+            self.field, m.stack, m.terms, m.results, self.state, m.cache, prepared.key,
+            walk.nodes, len(walk.nodes), prepared.nodes, prepared.first, prepared.last_changed,
+            self.regressed, self.progress,
+        )  # fmt: skip
 
-        manager.run(step)
-        return manager.handle(int(regressed[-1]), self.leaf_type)
+    @property
+    def result(self) -> Diagram:
+        """The regression, when it is done."""
+        return self.manager.handle(int(self.regressed[-1]), self.leaf_type)
