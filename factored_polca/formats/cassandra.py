@@ -58,7 +58,8 @@ from factored_polca.models.model import Model
 from factored_polca.models.scalars import describe, scalar
 
 __all__ = [
-    "read_pomdp", "read_pomdp_with_warnings", "write_factored", "write_mdp", "write_model", "write_pomdp",
+    "plainly_labelled", "read_pomdp", "read_pomdp_with_warnings", "write_factored", "write_mdp",
+    "write_model", "write_pomdp",
 ]  # fmt: skip
 
 MAXIMUM_LISTED = 20_000
@@ -90,10 +91,10 @@ def write_model(model: Model) -> str:
         ", ".join(f"{f.name}={describe(scalar(v))}" for f, v in zip(model.features, values, strict=True))
         for values in exact.state_values
     ]
-    return write_pomdp(_plainly_labelled(exact.to_arrays(), model), model.name, shown)
+    return write_pomdp(plainly_labelled(exact.to_arrays(), model), model.name, shown)
 
 
-def _plainly_labelled(pomdp: ArrayPOMDP, model: Model) -> ArrayPOMDP:
+def plainly_labelled(pomdp: ArrayPOMDP, model: Model) -> ArrayPOMDP:
     """The arrays of `model`; what its only channel says is not called `channel=value` but `value`.
 
     The first action has all that the channel says, in its order: so a file that was read keeps its own.

@@ -161,6 +161,30 @@ class PomdpQuotient:
 
         write_text(path, lambda: self.to_pomdp_text(first_step=first_step))
 
+    def to_pomdpx(self, path: str | Path, *, first_step: bool = False) -> None:
+        """Write the quotient as a POMDPX file with one variable, the block; it appears whole or not at all.
+
+        `first_step` is that of `to_pomdp`.
+
+        Raises:
+            ModelError: the format can't express it, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, lambda: self.to_pomdpx_text(first_step=first_step))
+
+    def to_pomdpx_text(self, *, first_step: bool = False) -> str:
+        """The text that `to_pomdpx` writes.
+
+        Raises:
+            ModelError: the format can't express it.
+        """
+        from factored_polca.formats.cassandra import read_pomdp
+        from factored_polca.formats.pomdpx import write_pomdpx
+
+        text = self.to_pomdp_text(first_step=first_step)
+        return write_pomdpx(read_pomdp(text, self.process.symbolic.model.name))
+
     def to_pomdp_text(self, *, first_step: bool = False) -> str:
         """The text that `to_pomdp` writes.
 

@@ -98,6 +98,27 @@ class Quotient:
 
         write_text(path, self.to_pomdp_text)
 
+    def to_pomdpx(self, path: str | Path) -> None:
+        """Write the quotient as a POMDPX file with one variable, the block; it appears whole or not at all.
+
+        Raises:
+            ModelError: a choice does not apply everywhere, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, self.to_pomdpx_text)
+
+    def to_pomdpx_text(self) -> str:
+        """The text that `to_pomdpx` writes.
+
+        Raises:
+            ModelError: a choice does not apply everywhere.
+        """
+        from factored_polca.formats.cassandra import read_pomdp
+        from factored_polca.formats.pomdpx import write_pomdpx
+
+        return write_pomdpx(read_pomdp(self.to_pomdp_text(), self.process.symbolic.model.name))
+
     def to_pomdp_text(self) -> str:
         """The text that `to_pomdp` writes.
 
