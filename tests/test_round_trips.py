@@ -38,6 +38,8 @@ class Row:
     spudd: Outcome = ...
     pomdpx: Outcome = ...
     cassandra: Outcome = ...
+    ends: int = 1
+    """Blocks of terminal states, which are one block, once they are states like others: what is seen differs."""
 
 
 ROWS = [
@@ -54,7 +56,7 @@ ROWS = [
     Row("network", {"size": "3"}),
     Row("nursebot", {}, pomdpx="", cassandra=""),
     Row("part_painting", {}),
-    Row("rocksample", {"size": "3", "rocks": "2"}),
+    Row("rocksample", {"size": "3", "rocks": "2"}, ends=3),  # the rover's row is seen beyond the edge, too
     Row("sysadmin", {"size": "4"}),
     Row("taxi", {"size": "2"}),
     Row("tiger", {}),
@@ -127,7 +129,7 @@ def test_a_domain_is_worth_the_same_in_each_format(row: Row, extension: str) -> 
     back = again(Document(model), extension).model
     assert value_of(back) == pytest.approx(value_of(model), rel=1e-9, abs=1e-9)
     if extension != ".pomdp":  # a flat file has states of its own for what was seen
-        assert blocks_of(back) == blocks_of(model)
+        assert blocks_of(back) == blocks_of(model) + row.ends - 1
 
 
 def blocks_of(model: Model) -> int:
