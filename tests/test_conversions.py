@@ -1,4 +1,4 @@
-"""Every pair of formats: `convert` writes one from the other, `info` tells of each, in any case of letters."""
+"""Every pair of formats: `convert` writes one from the other, `info` tells of each, in any case."""
 
 from __future__ import annotations
 

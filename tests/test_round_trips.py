@@ -39,7 +39,7 @@ class Row:
     pomdpx: Outcome = ...
     cassandra: Outcome = ...
     ends: int = 1
-    """Blocks of terminal states, which are one block, once they are states like others: what is seen differs."""
+    """Blocks of terminal states once they are states like others: more than one if what is seen differs."""
 
 
 ROWS = [
