@@ -176,14 +176,36 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
         ModelError: no such file, no known format, or a text at fault; names file, line and column.
     """
     chosen, both = format_of(path), parts(path)
-    try:
-        if chosen is _RDDL:
-            texts = [_text(part, strict=False) for part in both]
+    if chosen is _RDDL:
+        try:
+            texts = [_decoded(_bytes(part, named=True), strict=False) for part in both]
             document = _read_rddl_texts(texts, overrides or {}, [str(part) for part in both])
-        else:
-            document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
+        except ModelError as error:
+            raise error.in_file(str(path)) from None
+        return _located(document, path)
+    try:
+        data = _bytes(Path(path))
     except ModelError as error:
         raise error.in_file(str(path)) from None
+    return document_of(data, path, overrides)
+
+
+def document_of(data: bytes, path: str | Path, overrides: Mapping[str, str] | None = None) -> Document:
+    """The model in `data`, the bytes of a file called `path`: its extension tells the format.
+
+    Raises:
+        ModelError: no known format, or a text at fault; names file, line and column.
+    """
+    chosen = format_of(path)
+    try:
+        document = chosen.read(_decoded(data), overrides or {}, Path(path).stem)
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    return _located(document, path)
+
+
+def _located(document: Document, path: str | Path) -> Document:
+    """The document, its warnings and later faults told with the file's name."""
 
     def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
         return ModelError(document.locate(faults)).in_file(str(path)).faults
@@ -203,21 +225,27 @@ def parts(path: str | Path) -> tuple[Path, ...]:
     return (Path(path),)
 
 
-def _text(path: Path, *, strict: bool = True) -> str:
-    """The text of a file; without `strict`, bytes that are no UTF-8 become one sign, not a fault."""
+def _bytes(path: Path, *, named: bool = False) -> bytes:
+    """What a file holds; `named`: its own name is told where it is missing."""
     try:
         with path.open("rb") as stream:
             data = stream.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         listed = ", ".join(FORMATS)
         fault = Fault(
-            "there is no such file", hint=f"formats are {listed}", file="" if strict else str(path)
+            "there is no such file", hint=f"formats are {listed}", file=str(path) if named else ""
         )
         raise ModelError([fault]) from None
     except (OSError, ValueError) as error:
         raise ModelError(f"the file can't be read: {_reason(error)}") from None
+    return data
+
+
+def _decoded(data: bytes, *, strict: bool = True) -> str:
+    """The text; without `strict`, bytes that are no UTF-8 become one sign, not a fault."""
     if len(data) > MAXIMUM_BYTES:
-        raise ModelError(f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read")
+        message = f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read"
+        raise ModelError([Fault(message, line=1, column=1)])
     try:
         return data.decode("utf-8", "strict" if strict else "replace")
     except UnicodeDecodeError as error:
