@@ -28,13 +28,20 @@ def commands() -> dict[str, Callable[..., int]]:
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
-        "figure": figure.figure, "bench": run_bench, "compare": compare.compare,
+        "figure": figure.figure, "bench": run_bench, "study": run_study, "compare": compare.compare,
     }  # fmt: skip
 
 
 def run_plan(arguments: argparse.Namespace, output: Output) -> int:
     """The command `run`, whose module loads all that tracks beliefs."""
     from factored_polca.cli.run import run as work
+
+    return work(arguments, output)
+
+
+def run_study(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `study`, which needs none of the libraries that compute."""
+    from factored_polca.cli.study import study as work
 
     return work(arguments, output)
 

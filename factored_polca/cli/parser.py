@@ -20,6 +20,7 @@ from factored_polca.cli.argument_types import (
 )
 from factored_polca.cli.bench_arguments import add_bench
 from factored_polca.cli.compare_arguments import add_comparing
+from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
 hierarchies: each subtask is minimised exactly on decision diagrams, without enumerating states, and
@@ -183,7 +184,10 @@ def parser() -> argparse.ArgumentParser:
         command("compare", "Compare two plans, or policies, of one model on the same random numbers.")
     )
     add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
-    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
+    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, 4c, table1."))
+    add_study(
+        command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
+    )
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
@@ -238,6 +242,9 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the model"
         )
         found.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
+        return found
+
+    def with_trials(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "--trials",
             type=counting,
@@ -245,12 +252,15 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             metavar="N",
             help=f"trials a task of PolCA+ ({TRIALS})",
         )
-        return found
 
     def with_picture(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "model", metavar="MODEL", nargs="?", default="nursebot", help="nursebot if not given"
         )
+        with_trials(found)
+        with_output(found)
+
+    def with_output(found: argparse.ArgumentParser) -> None:
         found.add_argument("-o", "--output", metavar="FILE.png", help="draw it (needs matplotlib)")
 
     def with_flat_trials(found: argparse.ArgumentParser) -> None:
@@ -274,4 +284,11 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
     found.add_argument(
         "--perturbation", type=discount, metavar="Q", help="by up to which share they are changed (0.2)"
     )
-    with_flat_trials(one("table1", "What the controller does in the dialogue of the paper's Table 1."))
+    found = one("4c", "What PolCA and learners store for Taxi and Taxi2, and how fast these learn.")
+    found.add_argument(
+        "--episodes", type=counting, metavar="N", help="of each learner; 100 for each state if not given"
+    )
+    with_output(found)
+    found = one("table1", "What the controller does in the dialogue of the paper's Table 1.")
+    with_trials(found)
+    with_flat_trials(found)

@@ -97,10 +97,25 @@ def _write_cassandra(document: Document) -> str:
     return write_model(document.model)
 
 
+def _read_prism(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    from factored_polca.formats.prism import read_prism
+
+    model, warnings, locate = read_prism(text, overrides, name)
+    return Document(model, None, warnings, locate)
+
+
+def _write_prism(document: Document) -> str:
+    _refuse_tasks(document, "PRISM's language")
+    from factored_polca.formats.prism_writer import write_prism
+
+    return write_prism(document.model)
+
+
 _NATIVE: Final = Format("native", _read_native, _write_native)
 _SPUDD: Final = Format("SPUDD", _read_spudd, _write_spudd)
 _POMDPX: Final = Format("POMDPX", _read_pomdpx, _write_pomdpx)
 _CASSANDRA: Final = Format("Cassandra", _read_cassandra, _write_cassandra)
+_PRISM: Final = Format("PRISM", _read_prism, _write_prism)
 
 FORMATS: Final[Mapping[str, Format]] = {
     ".toml": _NATIVE,
@@ -109,6 +124,9 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".pomdpx": _POMDPX,
     ".pomdp": _CASSANDRA,
     ".mdp": _CASSANDRA,
+    ".prism": _PRISM,
+    ".nm": _PRISM,
+    ".pm": _PRISM,
 }
 
 

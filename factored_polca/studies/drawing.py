@@ -24,6 +24,7 @@ from factored_polca.studies.rewards import PAIRS, RewardStudy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = [
     "MissingLibrary", "draw_parameters", "draw_perturbations", "draw_rewards", "require_matplotlib",
@@ -54,12 +55,25 @@ def write_drawing(
         ModelError: no such folder, or no regular file in the file's place.
         OSError: the file can't be written.
     """
+    write_figure(path, lambda figure: draw(figure.add_subplot()), width=width, height=height)
+
+
+def write_figure(
+    path: str | Path, fill: Callable[[Figure], object], *, width: float, height: float
+) -> None:
+    """Write a figure of several drawings, which `fill` makes, as a PNG; else like `write_drawing`.
+
+    Raises:
+        MissingLibrary: matplotlib is not installed.
+        ModelError: no such folder, or no regular file in the file's place.
+        OSError: the file can't be written.
+    """
     require_matplotlib()
     from matplotlib.figure import Figure
 
     target = destination(path)
     figure = Figure(figsize=(width, height), layout="constrained")
-    draw(figure.add_subplot())
+    fill(figure)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
     temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
