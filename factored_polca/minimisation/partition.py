@@ -40,7 +40,7 @@ class Partition(Drawn, Framed):
 
     @cached_property
     def representatives(self) -> npt.NDArray[np.int32]:
-        """The first state of each block: value numbers int32 [block, level]."""
+        """The first state of each block, as value numbers int32 [block, level]."""
         states = states_for_leaves(self.diagram)
         result = np.zeros((self.blocks, self.symbolic.manager.leaf_level), dtype=np.int32)
         for state, leaf in zip(states, leaves(self.diagram), strict=True):

@@ -176,7 +176,7 @@ class Model(DrawnGraph):
 
     @property
     def states(self) -> int:
-        """The number of states: the full product, terminal and unreachable ones included."""
+        """The number of states in the full product, terminal and unreachable ones included."""
         return math.prod(len(feature.values) for feature in self.features)
 
     def feature(self, name: str) -> Feature:
