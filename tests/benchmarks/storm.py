@@ -109,7 +109,7 @@ def begun(model: Any) -> Any:
     """The model from one state, where an action `begin` draws what the initial belief leaves open.
 
     Storm lists the states of an `init` with an SMT solver, one by one, which would take most of its time;
-    so it gets this model, one state larger, and we the original, to which `begin` is no help.
+    so its sparse engine gets this model, one state larger; its dd engine and we get the original.
     """
     from factored_polca.models import FALSE, TRUE, Action, boolean, conjunction, lottery, operation
     from factored_polca.models.expressions import Constant, Lottery
@@ -234,11 +234,12 @@ def table(limits: argparse.Namespace) -> None:
     for number in chosen:
         case = CASES[number]
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "model.prism"
-            subprocess.run([sys.executable, __file__, "--write", str(number), str(path)], check=True)
             ours = measured(["--ours", str(number)], limits)
             show(case, "ours, interchangeable" if case.interchangeable else "ours", ours, ours)
             for engine in case.engines:
+                path = Path(folder) / f"{engine}.prism"
+                command = [sys.executable, __file__, "--write", str(number), str(path), engine]
+                subprocess.run(command, check=True)
                 show(case, engine, measured(["--storm", str(path), engine], limits), ours)
 
 
@@ -268,15 +269,14 @@ def main() -> None:
     parser.add_argument("--gigabytes", type=float, default=12)
     parser.add_argument("--ours", type=int)
     parser.add_argument("--storm", nargs=2)
-    parser.add_argument("--write", nargs=2)
+    parser.add_argument("--write", nargs=3)
     arguments = parser.parse_args()
     if arguments.write:
         from factored_polca.formats.prism_writer import write_prism
 
-        number, path = arguments.write
-        Path(path).write_text(
-            write_prism(model_of(CASES[int(number)], from_one_state=True)), encoding="utf-8"
-        )
+        number, path, engine = arguments.write
+        model = model_of(CASES[int(number)], from_one_state=engine == "sparse")
+        Path(path).write_text(write_prism(model), encoding="utf-8")
         return
     if arguments.ours is None and not arguments.storm:
         table(arguments)
