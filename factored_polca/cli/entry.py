@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
-    from factored_polca.cli import act, figure, models, plan, simulate, solve
+    from factored_polca.cli import act, compare, figure, models, plan, simulate, solve
     from factored_polca.cli import commands as work
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
-        "figure": figure.figure, "bench": run_bench, "study": run_study,
+        "figure": figure.figure, "bench": run_bench, "study": run_study, "compare": compare.compare,
     }  # fmt: skip
 
 

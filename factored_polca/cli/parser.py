@@ -19,6 +19,7 @@ from factored_polca.cli.argument_types import (
     solver,
 )
 from factored_polca.cli.bench_arguments import add_bench
+from factored_polca.cli.compare_arguments import add_comparing
 from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
@@ -183,6 +184,9 @@ def parser() -> argparse.ArgumentParser:
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
+    add_comparing(
+        command("compare", "Compare two plans, or policies, of one model on the same random numbers.")
+    )
     add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
     add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, 4c, table1."))
     add_study(

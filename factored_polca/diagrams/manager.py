@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,9 @@ class Manager:
         self.leaf_level = len(self.sizes)
         self.memory_limit = available_memory() * 3 // 4 if memory_limit is None else memory_limit
         self.deadline: float | None = None
+        self.describe: Callable[[int], tuple[str, tuple[Any, ...]]] | None = (
+            None  # a level's name and values
+        )
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0

@@ -98,6 +98,20 @@ def _write_cassandra(document: Document) -> str:
     return write_model(document.model)
 
 
+def _read_prism(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    from factored_polca.formats.prism import read_prism
+
+    model, warnings, locate = read_prism(text, overrides, name)
+    return Document(model, None, warnings, locate)
+
+
+def _write_prism(document: Document) -> str:
+    _refuse_tasks(document, "PRISM's language")
+    from factored_polca.formats.prism_writer import write_prism
+
+    return write_prism(document.model)
+
+
 def _read_rddl(text: str, overrides: Mapping[str, str], name: str) -> Document:
     return _read_rddl_texts((text,), overrides, ("",))
 
@@ -120,6 +134,7 @@ _NATIVE: Final = Format("native", _read_native, _write_native)
 _SPUDD: Final = Format("SPUDD", _read_spudd, _write_spudd)
 _POMDPX: Final = Format("POMDPX", _read_pomdpx, _write_pomdpx)
 _CASSANDRA: Final = Format("Cassandra", _read_cassandra, _write_cassandra)
+_PRISM: Final = Format("PRISM", _read_prism, _write_prism)
 _RDDL: Final = Format("RDDL", _read_rddl, _write_rddl)
 
 FORMATS: Final[Mapping[str, Format]] = {
@@ -129,6 +144,9 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".pomdpx": _POMDPX,
     ".pomdp": _CASSANDRA,
     ".mdp": _CASSANDRA,
+    ".prism": _PRISM,
+    ".nm": _PRISM,
+    ".pm": _PRISM,
     ".rddl": _RDDL,
 }
 
@@ -158,14 +176,36 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
         ModelError: no such file, no known format, or a text at fault; names file, line and column.
     """
     chosen, both = format_of(path), parts(path)
-    try:
-        if chosen is _RDDL:
-            texts = [_text(part, strict=False) for part in both]
+    if chosen is _RDDL:
+        try:
+            texts = [_decoded(_bytes(part, named=True), strict=False) for part in both]
             document = _read_rddl_texts(texts, overrides or {}, [str(part) for part in both])
-        else:
-            document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
+        except ModelError as error:
+            raise error.in_file(str(path)) from None
+        return _located(document, path)
+    try:
+        data = _bytes(Path(path))
     except ModelError as error:
         raise error.in_file(str(path)) from None
+    return document_of(data, path, overrides)
+
+
+def document_of(data: bytes, path: str | Path, overrides: Mapping[str, str] | None = None) -> Document:
+    """The model in `data`, the bytes of a file called `path`: its extension tells the format.
+
+    Raises:
+        ModelError: no known format, or a text at fault; names file, line and column.
+    """
+    chosen = format_of(path)
+    try:
+        document = chosen.read(_decoded(data), overrides or {}, Path(path).stem)
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    return _located(document, path)
+
+
+def _located(document: Document, path: str | Path) -> Document:
+    """The document, its warnings and later faults told with the file's name."""
 
     def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
         return ModelError(document.locate(faults)).in_file(str(path)).faults
@@ -185,21 +225,27 @@ def parts(path: str | Path) -> tuple[Path, ...]:
     return (Path(path),)
 
 
-def _text(path: Path, *, strict: bool = True) -> str:
-    """The text of a file; without `strict`, bytes that are no UTF-8 become one sign, not a fault."""
+def _bytes(path: Path, *, named: bool = False) -> bytes:
+    """What a file holds; `named`: its own name is told where it is missing."""
     try:
         with path.open("rb") as stream:
             data = stream.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         listed = ", ".join(FORMATS)
         fault = Fault(
-            "there is no such file", hint=f"formats are {listed}", file="" if strict else str(path)
+            "there is no such file", hint=f"formats are {listed}", file=str(path) if named else ""
         )
         raise ModelError([fault]) from None
     except (OSError, ValueError) as error:
         raise ModelError(f"the file can't be read: {_reason(error)}") from None
+    return data
+
+
+def _decoded(data: bytes, *, strict: bool = True) -> str:
+    """The text; without `strict`, bytes that are no UTF-8 become one sign, not a fault."""
     if len(data) > MAXIMUM_BYTES:
-        raise ModelError(f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read")
+        message = f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read"
+        raise ModelError([Fault(message, line=1, column=1)])
     try:
         return data.decode("utf-8", "strict" if strict else "replace")
     except UnicodeDecodeError as error:

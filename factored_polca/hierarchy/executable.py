@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams import INDEX, Diagram, choose, pairs, relabel
 from factored_polca.diagrams.operations import leaf_payloads
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import planning_order
 from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.hierarchy.solved import SolvedTask
@@ -25,7 +26,7 @@ from factored_polca.symbolic import SymbolicModel
 
 
 @dataclass(frozen=True)
-class TaskPolicy:
+class TaskPolicy(DrawnGraph):
     """The policy of one task over the blocks of its partition.
 
     `choice[b]` is the number of the chosen one of `actions`, -1 where there is none (the task has
@@ -41,7 +42,7 @@ class TaskPolicy:
 
 
 @dataclass(frozen=True)
-class ExecutablePlan:
+class ExecutablePlan(DrawnGraph, Framed):
     """A hierarchical policy that can be executed, saved and loaded.
 
     `policy` maps each state to the number of the model's action that is taken, or to the number of

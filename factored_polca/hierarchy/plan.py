@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, relabel
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
 from factored_polca.hierarchy.options import Options
@@ -60,7 +61,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class HierarchicalPlan:
+class HierarchicalPlan(DrawnGraph, Framed):
     """A solved hierarchy.
 
     `solved` lists the tasks children first, the root last.  `polled` is the value of the polled

@@ -29,6 +29,7 @@ from typing import Final
 import numpy as np
 
 from factored_polca.diagrams import Diagram
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import (
     checked,
     custom_solver,
@@ -71,7 +72,7 @@ class FlatBound:
 
 
 @dataclass(frozen=True)
-class PomdpPlan:
+class PomdpPlan(DrawnGraph, Framed):
     """A hierarchy solved under partial observability; `solved` lists the tasks children first."""
 
     symbolic: SymbolicModel

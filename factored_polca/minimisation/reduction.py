@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, INDEX, Diagram, at, choose, evaluate_states, relabel
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.arrays import ArrayMDP
 from factored_polca.minimisation.criterion import DecisionProcess
 from factored_polca.minimisation.interchangeable import InterchangeableQuotient, interchangeable_quotient
@@ -33,7 +34,7 @@ from factored_polca.models import Value
 
 
 @dataclass(frozen=True)
-class Reduction:
+class Reduction(DrawnGraph, Framed):
     """A minimised decision process: the partition, the quotient, and how to get there and back."""
 
     minimisation: Minimisation
