@@ -71,7 +71,9 @@ if TYPE_CHECKING:
     )
     from factored_polca.simulation import Simulation, simulate
     from factored_polca.simulation.belief_runs import BeliefRuns
+    from factored_polca.simulation.comparison import Comparison, compare
     from factored_polca.simulation.measure import Measurement, measure
+    from factored_polca.simulation.trace import Trace, trace
     from factored_polca.solvers import MDPSolution, solve_mdp
     from factored_polca.solvers.pomdp_choose import solve_pomdp
     from factored_polca.solvers.pomdp_result import Demand, POMDPSolution
@@ -107,7 +109,9 @@ _HOME: Final = {
     ),
     "simulation": ("Simulation", "simulate"),
     "simulation.belief_runs": ("BeliefRuns",),
+    "simulation.comparison": ("Comparison", "compare"),
     "simulation.measure": ("Measurement", "measure"),
+    "simulation.trace": ("Trace", "trace"),
     "solvers": ("MDPSolution", "solve_mdp"),
     "solvers.pomdp_choose": ("solve_pomdp",),
     "solvers.pomdp_result": ("Demand", "POMDPSolution"),
@@ -124,18 +128,18 @@ _MODULE: Final = {name: module for module, names in _HOME.items() for name in na
 
 __all__ = [
     "Aborted", "Action", "ArrayPOMDP", "Belief", "BeliefController", "BeliefDecision", "BeliefRuns",
-    "Certificate", "Controller", "Decision", "Demand", "Diagram", "Document", "ExecutablePlan",
-    "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief", "LimitReached",
-    "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation", "Model",
-    "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpPlan",
+    "Certificate", "Comparison", "Controller", "Decision", "Demand", "Diagram", "Document",
+    "ExecutablePlan", "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief",
+    "LimitReached", "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation",
+    "Model", "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpPlan",
     "PomdpSolver", "Reduction", "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task",
-    "TaskHierarchy", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify", "check",
-    "check_tasks", "choose_tracker", "compile_model", "conditional", "domains", "executable",
-    "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan",
+    "TaskHierarchy", "Trace", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify",
+    "check", "check_tasks", "choose_tracker", "compare", "compile_model", "conditional", "domains",
+    "executable", "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan",
     "load_pomdp_plan", "lottery", "measure", "minimise", "plan", "plan_mdp", "plan_pomdp",
-    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "save_plan",
-    "save_pomdp_plan", "simulate", "solution_of_actions", "solution_of_policy", "solve_mdp",
-    "solve_pomdp", "uniform", "unreduced_pomdp", "write",
+    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "save_plan", "save_pomdp_plan",
+    "simulate", "solution_of_actions", "solution_of_policy", "solve_mdp", "solve_pomdp", "trace",
+    "uniform", "unreduced_pomdp", "write",
 ]  # fmt: skip
 
 

@@ -402,10 +402,11 @@ def test_what_is_wrong_with_a_solver_is_said(
     assert "a fault of factored-polca" not in message
 
 
-def test_the_solver_in_the_readme_works(
+def test_the_solver_in_the_documentation_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
+    page = Path(__file__).resolve().parent.parent / "docs" / "howto" / "write-a-solver.md"
+    text = page.read_text(encoding="utf-8")
     (body,) = re.findall(r"^```python\n# qmdp\.py\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     (tmp_path / "readme_qmdp.py").write_text(body, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)

@@ -13,10 +13,13 @@ from random_models import random_model
 
 from factored_polca.diagrams import evaluate_states
 from factored_polca.explicit.enumeration import enumerate_model
+from factored_polca.explicit.exact_dynamic_programming import optimal_solution
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.minimiser import minimise as minimise_named
 from factored_polca.explicit.minimiser import minimise_interchangeable
-from factored_polca.hierarchy.plan import expectation
+from factored_polca.hierarchy import Options, plan
+from factored_polca.hierarchy.executable import composed_policy, executable
+from factored_polca.hierarchy.plan import expectation, plan_mdp
 from factored_polca.library import load
 from factored_polca.minimisation import (
     Choice,
@@ -195,3 +198,56 @@ def test_tiger_does_not_exchange_its_doors() -> None:
         minimise(process, interchangeable=True)
     with pytest.raises(ModelError, match="a state that is seen"):
         interchangeable_quotient(process, minimise(process).partition)
+
+
+# -- plans ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seeds", [range(start, start + 10) for start in range(0, 40, 10)], ids=str)
+def test_a_plan_with_exchanged_actions_earns_the_optimum_of_the_named_ones(seeds: range) -> None:
+    done = 0
+    for seed in seeds:
+        model = copied_actions(seed) if seed % 2 else permuted_actions(seed)
+        mdp = enumerate_model(model)
+        if (
+            len(
+                {
+                    r
+                    for row, app in zip(mdp.rewards, mdp.applicable, strict=True)
+                    for r, here in zip(row, app, strict=True)
+                    if here
+                }
+            )
+            == 1
+        ):
+            continue  # nothing to optimise
+        done += 1
+        exact, start = optimal_solution(mdp), mdp.initial
+        found = plan_mdp(model, options=Options(interchangeable=True, seed=seed))
+        expected = sum(float(b * v) for b, v in zip(start, exact.values, strict=True) if b)
+        assert found.polled.value == pytest.approx(expected, rel=1e-7, abs=1e-7), seed
+        # what is executed, block by block, is the lifted policy
+        made = executable(found)
+        composed = composed_policy(found.symbolic, found.tasks, made.policies)
+        assert composed == made.policy, seed
+    assert done > 4
+
+
+def test_a_plan_for_twenty_machines_reboots_one_that_is_down() -> None:
+    model = load("sysadmin", {"size": "20", "topology": "independent"}).model
+    found = plan_mdp(model, options=Options(interchangeable=True))
+    assert found.root.reduction.partition.blocks == 21
+    assert found.flat is not None
+    assert found.flat.value == pytest.approx(found.polled.value, rel=1e-8)
+    policy = executable(found)
+    names = [action.name for action in model.actions]
+    states = np.ones((21, 20), dtype=np.int32)
+    for machine in range(20):
+        states[machine, machine] = 0
+    taken = evaluate_states(policy.policy, states, found.symbolic.columns()).tolist()
+    assert [names[a] for a in taken[:20]] == [f"reboot_{machine}" for machine in range(20)]
+
+
+def test_plans_where_the_state_is_not_seen_do_not_exchange_actions() -> None:
+    with pytest.raises(ModelError, match="interchangeable actions need a state that is seen"):
+        plan(load("tiger").model, options=Options(interchangeable=True))

@@ -17,21 +17,22 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "factored_polca"
 
-MODELS = {"models"}
+MODELS = {"models", "drawn"}
 SYMBOLIC = {"symbolic", "diagrams", *MODELS}
 MINIMISATION = {"minimisation", "explicit", *SYMBOLIC}
 HIERARCHY = {"hierarchy", "solvers", "formats", *MINIMISATION}
 CONTROL = {"control", "hierarchy", *MINIMISATION}
 
 MAY_IMPORT: dict[str, set[str]] = {
-    "models": set(),
-    "diagrams": set(),
+    "drawn": set(),  # methods that call `display` when something is to be drawn
+    "models": {"drawn"},
+    "diagrams": {"drawn"},
     "library": MODELS,
-    "symbolic": {"models", "diagrams"},
+    "symbolic": {"diagrams", *MODELS},
     "explicit": MODELS,
-    "formats": {"models", "explicit"},
+    "formats": {"explicit", *MODELS},
     "minimisation": MINIMISATION,
-    "solvers": {"explicit", "models"},
+    "solvers": {"explicit", *MODELS},
     "hierarchy": HIERARCHY,  # plan files hold the model in the native format
     "control": CONTROL,
     "simulation": {"control", "hierarchy", "explicit", *SYMBOLIC},  # what it runs is a hierarchy's plan

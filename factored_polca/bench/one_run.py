@@ -14,22 +14,33 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from factored_polca import library
+from factored_polca.bench.dyadic import dyadic
 from factored_polca.bench.memory import peak_bytes
 from factored_polca.hierarchy.warm import warm_up
 from factored_polca.minimisation import flat_process, minimise
+from factored_polca.models import Model
 from factored_polca.symbolic import compile_model
 
 
-def run(domain: str, settings: dict[str, str], interchangeable: bool) -> dict[str, Any]:
+def model_of(domain: str, settings: Mapping[str, str], denominator: int | None) -> Model:
+    """A shipped domain, its probabilities dyadic where there is a `denominator`."""
+    model = library.load(domain, dict(settings)).model
+    return model if denominator is None else dyadic(model, denominator)
+
+
+def run(
+    domain: str, settings: Mapping[str, str], denominator: int | None, interchangeable: bool
+) -> dict[str, Any]:
     """Minimise one domain and say what it took."""
     began = time.process_time()
     warm_up()
     warmed = time.process_time()
     before = peak_bytes()
-    model = library.load(domain, settings).model
+    model = model_of(domain, settings, denominator)
     loaded = time.process_time()
     symbolic = compile_model(model)
     compiled = time.process_time()
@@ -50,4 +61,4 @@ def run(domain: str, settings: dict[str, str], interchangeable: bool) -> dict[st
 
 if __name__ == "__main__":
     given = json.loads(sys.argv[1])
-    print(json.dumps(run(given["domain"], given["settings"], given["interchangeable"])))
+    print(json.dumps(run(**given)))

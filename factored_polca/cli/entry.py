@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
-    from factored_polca.cli import act, figure, models, plan, simulate, solve
+    from factored_polca.cli import act, compare, figure, models, plan, simulate, solve
     from factored_polca.cli import commands as work
 
     return {
         "domains": models.domains, "new": models.new, "info": models.info, "check": models.check,
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
-        "figure": figure.figure,
+        "figure": figure.figure, "bench": run_bench, "study": run_study, "compare": compare.compare,
     }  # fmt: skip
 
 
@@ -37,6 +37,20 @@ def run_plan(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.cli.run import run as work
 
     return work(arguments, output)
+
+
+def run_study(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `study`, which needs none of the libraries that compute."""
+    from factored_polca.cli.study import study as work
+
+    return work(arguments, output)
+
+
+def run_bench(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `bench`."""
+    from factored_polca.cli.bench import bench
+
+    return bench(arguments, output)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

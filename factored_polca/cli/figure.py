@@ -1,4 +1,4 @@
-"""The command `figure`: the paper's Figures 4a and 4b and its Table 1, from our own runs."""
+"""The command `figure`: the paper's Figures 4a, 4b and 4c and its Table 1, from our own runs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factored_polca.cli.commands import compile_kernels, refuse_unwritable, report_warnings
+from factored_polca.cli.figure_q_values import figure_4c
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_settings
 
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 
 def figure(arguments: argparse.Namespace, output: Output) -> int:
     """Compute one of the figures, print its table, and draw it where that is asked for."""
-    work: dict[str, Callable[..., int]] = {"4a": figure_4a, "4b": figure_4b, "table1": table_1}
+    work: dict[str, Callable[..., int]] = {
+        "4a": figure_4a, "4b": figure_4b, "4c": figure_4c, "table1": table_1,
+    }  # fmt: skip
     if getattr(arguments, "output", None) is not None:
         refuse_undrawable(arguments.output)
     return work[arguments.which](arguments, output)

@@ -18,6 +18,9 @@ from factored_polca.cli.argument_types import (
     size,
     solver,
 )
+from factored_polca.cli.bench_arguments import add_bench
+from factored_polca.cli.compare_arguments import add_comparing
+from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
 hierarchies: each subtask is minimised exactly on decision diagrams, without enumerating states, and
@@ -119,6 +122,10 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
     sub.add_argument(
+        "--discount", type=discount, metavar="D",
+        help="plan without end, with this discount: in place of the model's discount and horizon",
+    )  # fmt: skip
+    sub.add_argument(
         "--solver", default="auto", type=solver, metavar="NAME",
         help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has; or "
         "package.module:Name, which is imported",
@@ -127,6 +134,10 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--flat-blocks", type=natural, default=100_000, metavar="N",
         help="leave out the flat optimum beyond N blocks (100000)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--interchangeable", action="store_true",
+        help="actions count by what they do, not by name (where the state is seen)",
     )  # fmt: skip
     group = sub.add_argument_group("where the state is not seen")
     group.add_argument(
@@ -173,7 +184,14 @@ def parser() -> argparse.ArgumentParser:
         "--steps", type=counting, metavar="T", help="steps an episode; by the discount if not given"
     )
     sub.add_argument("--seed", type=natural, default=0, metavar="S")
-    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, table1."))
+    add_comparing(
+        command("compare", "Compare two plans, or policies, of one model on the same random numbers.")
+    )
+    add_bench(command("bench", "Time minimisation on shipped domains, beside Storm where it is installed."))
+    add_figures(command("figure", "The figures of the paper, from our own runs: 4a, 4b, 4c, table1."))
+    add_study(
+        command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
+    )
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")
@@ -228,6 +246,9 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter of the model"
         )
         found.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
+        return found
+
+    def with_trials(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "--trials",
             type=counting,
@@ -235,12 +256,15 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
             metavar="N",
             help=f"trials a task of PolCA+ ({TRIALS})",
         )
-        return found
 
     def with_picture(found: argparse.ArgumentParser) -> None:
         found.add_argument(
             "model", metavar="MODEL", nargs="?", default="nursebot", help="nursebot if not given"
         )
+        with_trials(found)
+        with_output(found)
+
+    def with_output(found: argparse.ArgumentParser) -> None:
         found.add_argument("-o", "--output", metavar="FILE.png", help="draw it (needs matplotlib)")
 
     def with_flat_trials(found: argparse.ArgumentParser) -> None:
@@ -264,4 +288,11 @@ def add_figures(sub: argparse.ArgumentParser) -> None:
     found.add_argument(
         "--perturbation", type=discount, metavar="Q", help="by up to which share they are changed (0.2)"
     )
-    with_flat_trials(one("table1", "What the controller does in the dialogue of the paper's Table 1."))
+    found = one("4c", "What PolCA and learners store for Taxi and Taxi2, and how fast these learn.")
+    found.add_argument(
+        "--episodes", type=counting, metavar="N", help="of each learner; 100 for each state if not given"
+    )
+    with_output(found)
+    found = one("table1", "What the controller does in the dialogue of the paper's Table 1.")
+    with_trials(found)
+    with_flat_trials(found)

@@ -9,12 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from factored_polca.diagrams.leaves import LeafType, describe
+from factored_polca.drawn import DrawnGraph
 
 if TYPE_CHECKING:
     from factored_polca.diagrams.manager import Manager
 
 
-class Diagram:
+class Diagram(DrawnGraph):
     """A handle on a node; made by a `Manager` and by operations, never by hand."""
 
     __slots__ = ("__weakref__", "_slot", "leaf_type", "manager")

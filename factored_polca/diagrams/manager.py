@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,9 @@ class Manager:
         self.leaf_level = len(self.sizes)
         self.memory_limit = available_memory() * 3 // 4 if memory_limit is None else memory_limit
         self.deadline: float | None = None
+        self.describe: Callable[[int], tuple[str, tuple[Any, ...]]] | None = (
+            None  # a level's name and values
+        )
         self.peak_nodes = 0
         self.peak_bytes = 0
         self.collections = 0
@@ -252,9 +255,9 @@ class Manager:
         self.slots[:] = 0
         self.ring_state[0] = 0
         stack = np.empty(2 * self.leaf_level + 4, np.int32)
-        self._made = self.nodes_made
+        made = self.nodes_made
         compact(self.pool, self.head, self.unique, self.arity, self.roots, stack)
-        self._counted = int(self.head[1])
+        self._made, self._counted = made, int(self.head[1])
         self._live = int(self.head[0])
         self._plan_collection()
 

@@ -156,7 +156,7 @@ def check_undiscounted(symbolic: SymbolicModel, *, block_limit: int = 100_000) -
         return symbolic.state_text(partition.representatives[block].tolist())
 
     try:
-        solution = solve_mdp(reduction.quotient.mdp, describe=describe)
+        solution = solve_mdp(reduction.mdp, describe=describe)
     except ModelError as error:
         return list(error.faults)
     lost = np.flatnonzero((reduction.project_initial() > 0) & solution.dead_ends)

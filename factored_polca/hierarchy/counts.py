@@ -20,6 +20,7 @@ import numpy as np
 from factored_polca.diagrams import Diagram, Field, evaluate_states, random_prime, relabel
 from factored_polca.minimisation import Partition
 from factored_polca.minimisation.criterion import DecisionProcess, ProcessView
+from factored_polca.minimisation.interchangeable import InterchangeableQuotient
 from factored_polca.minimisation.quotient import feature_states
 from factored_polca.symbolic import NumericView
 
@@ -55,3 +56,15 @@ def count_q_values(process: DecisionProcess, partition: Partition, seed: int = 0
         by_action += len(classes)
         shared |= classes
     return QValueCounts(partition.blocks * len(process.choices), total, by_action, len(shared))
+
+
+def count_exchanged(quotient: InterchangeableQuotient) -> QValueCounts:
+    """Count the Q-values of a quotient whose actions are classes: a pair for each class of each block.
+
+    Blocks times the classes of the block that has most; pairs of equal signatures are one class.
+    """
+    there = quotient.first >= 0
+    classes, blocks = there.shape
+    by_class = sum(len(set(r[t].tolist())) for r, t in zip(quotient.residues, there, strict=True))
+    shared = len(set(quotient.residues[there].tolist()))
+    return QValueCounts(classes * blocks, int(there.sum()), by_class, shared)

@@ -13,16 +13,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import INDEX, Diagram, choose, relabel
+from factored_polca.diagrams import INDEX, Diagram, choose, pairs, relabel
+from factored_polca.diagrams.operations import leaf_payloads
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import planning_order
 from factored_polca.hierarchy.plan import HierarchicalPlan
+from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.minimisation import Partition
+from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import Model, TaskHierarchy
 from factored_polca.symbolic import SymbolicModel
 
 
 @dataclass(frozen=True)
-class TaskPolicy:
+class TaskPolicy(DrawnGraph):
     """The policy of one task over the blocks of its partition.
 
     `choice[b]` is the number of the chosen one of `actions`, -1 where there is none (the task has
@@ -38,7 +42,7 @@ class TaskPolicy:
 
 
 @dataclass(frozen=True)
-class ExecutablePlan:
+class ExecutablePlan(DrawnGraph, Framed):
     """A hierarchical policy that can be executed, saved and loaded.
 
     `policy` maps each state to the number of the model's action that is taken, or to the number of
@@ -60,21 +64,36 @@ class ExecutablePlan:
 
 def executable(plan: HierarchicalPlan, report: Mapping[str, Any] | None = None) -> ExecutablePlan:
     """What execution needs of a plan."""
-    policies = {
-        solved.task.name: TaskPolicy(
-            solved.task.name,
-            solved.task.actions,
-            solved.reduction.partition,
-            solved.solution.policy.astype(np.int32),
-            solved.solution.values,
-            solved.reduction.quotient.mdp.terminal,
-        )
-        for solved in plan.solved
-    }
+    policies = {solved.task.name: task_policy(solved) for solved in plan.solved}
     root = plan.root
     return ExecutablePlan(
         plan.symbolic, plan.tasks, root.task.name, policies, root.policy, dict(report or {})
     )
+
+
+def task_policy(solved: SolvedTask) -> TaskPolicy:
+    """The choice in each block; where actions were exchanged blocks are split by what is chosen."""
+    reduction, solution = solved.reduction, solved.solution
+    partition, choice = reduction.partition, solution.policy.astype(np.int32)
+    values, terminal = solution.values, reduction.mdp.terminal
+    if isinstance(reduction, InterchangeableReduction):
+        manager = partition.diagram.manager
+        joint, first, second = pairs(partition.diagram, reduction.lift_choices(solution.policy))
+        block = leaf_payloads(manager, first).astype(np.int64)
+        taken = leaf_payloads(manager, second).astype(np.int64)
+        inside = block < partition.blocks
+        order = np.argsort(~inside, kind="stable")  # what is outside comes last, as one
+        images = np.zeros(len(block), dtype=np.uint64)
+        images[order] = np.minimum(np.arange(len(block)), inside.sum())
+        count = int(inside.sum())
+        partition = Partition(
+            partition.symbolic, relabel(joint, images, INDEX), count, partition.has_outside
+        )
+        kept = order[:count]
+        none = len(reduction.process.choices)
+        choice = np.where(taken[kept] == none, -1, taken[kept]).astype(np.int32)
+        values, terminal = values[block[kept]], terminal[block[kept]]
+    return TaskPolicy(solved.task.name, solved.task.actions, partition, choice, values, terminal)
 
 
 def composed_policy(

@@ -32,6 +32,8 @@ class Options:
     and for children at all corners, and after `trials` trials; `gap` None is a thousandth of the span of
     the task's rewards.  `maximum_observations` caps the joint observations of one action of a task.
     `assume_observed` plans a partially observed model as if the state were seen (PolCA).
+
+    `interchangeable` tells actions by what they do and not by their names, where the state is seen.
     """
 
     seed: int = 0
@@ -47,3 +49,4 @@ class Options:
     trials: int | None = TRIALS
     maximum_observations: int = MAXIMUM_OBSERVATIONS
     assume_observed: bool = False
+    interchangeable: bool = False

@@ -20,14 +20,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, relabel
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
-from factored_polca.hierarchy.counts import QValueCounts, count_q_values
+from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.minimisation.criterion import policy_primitives
+from factored_polca.minimisation.polynomial import interchangeable_fault
+from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import (
     Fault,
     LimitReached,
@@ -58,7 +61,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class HierarchicalPlan:
+class HierarchicalPlan(DrawnGraph, Framed):
     """A solved hierarchy.
 
     `solved` lists the tasks children first, the root last.  `polled` is the value of the polled
@@ -112,6 +115,8 @@ def plan(
     """
     options = options or Options()
     if isinstance(model, Model) and model.observability == "partial" and not options.assume_observed:
+        if options.interchangeable:
+            raise ModelError([interchangeable_fault()])
         return plan_pomdp(model, tasks, options, progress=progress)
     return plan_mdp(model, tasks, options, progress=progress)
 
@@ -154,9 +159,8 @@ def plan_mdp(
             ]
         )
     if model.horizon is not None:
-        raise ModelError(
-            [Fault("a finite horizon can't be planned for", ("horizon",), "remove it, or give a discount")]
-        )
+        hint = "remove it and give a discount (plan --discount D), or use solve"
+        raise ModelError([Fault("a finite horizon can't be planned for", ("horizon",), hint)])
     hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
     symbolic = symbolic or compile_model(
         model,
@@ -211,6 +215,7 @@ class _Planner:
             seed=self.options.seed,
             block_limit=block_limit,
             progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
+            interchangeable=self.options.interchangeable and len(process.choices) > 1,
         )
 
     def optimise(
@@ -220,10 +225,10 @@ class _Planner:
         if custom is not None:
             options = self.options
             demand = Demand(gap=options.epsilon, deadline=options.deadline, seed=options.seed)
-            solution = call_mdp_solver(custom, reduction.quotient.mdp, demand)
+            solution = call_mdp_solver(custom, reduction.mdp, demand)
         else:
             solution = solve_mdp(
-                reduction.quotient.mdp,
+                reduction.mdp,
                 method,
                 self.options.epsilon,
                 deadline=self.options.deadline,
@@ -249,9 +254,12 @@ class _Planner:
         )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.reduce(task.name, process, self.options.block_limit)
-        refuse_without_purpose(task, reduction.quotient.mdp)
+        refuse_without_purpose(task, reduction.mdp)
         solution = self.optimise(task.name, reduction, method, self.custom if task.solver is None else None)
-        counts = count_q_values(process, reduction.partition, self.options.seed)
+        if isinstance(reduction, InterchangeableReduction):
+            counts = count_exchanged(reduction.exchanged)
+        else:
+            counts = count_q_values(process, reduction.partition, self.options.seed)
         policy = reduction.lift_policy(solution.policy)
         chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
         defined = relabel(reduction.partition.diagram, chosen, INDEX)
@@ -372,7 +380,7 @@ def task_warnings(
 
 def equal_across_choices(reduction: Reduction) -> bool:
     """Whether several choices, wherever they are applicable in one block, have one reward."""
-    mdp = reduction.quotient.mdp
+    mdp = reduction.mdp
     several = mdp.applicable.sum(axis=0) > 1
     if not several.any():
         return False

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from factored_polca.drawn import DrawnGraph
 from factored_polca.explicit.policies import AnyPolicy, horizon_of
 from factored_polca.formats import read_native, write_native
 from factored_polca.formats.archive import is_archive_with, reading, write_archive
@@ -34,7 +35,7 @@ HEAD: Final = "policy.json"
 
 
 @dataclass(frozen=True)
-class FlatPolicy:
+class FlatPolicy(DrawnGraph):
     """A policy, the arrays that it is for, and what was said when it was made."""
 
     flat: FlatModel

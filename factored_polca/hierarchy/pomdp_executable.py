@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, choose, relabel
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import BoolArray, IntArray
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
@@ -45,7 +46,7 @@ class BeliefTask:
 
 
 @dataclass(frozen=True)
-class ExecutablePomdpPlan:
+class ExecutablePomdpPlan(DrawnGraph, Framed):
     """A hierarchical policy over beliefs that can be executed, saved and loaded.
 
     `report` is what `plan --json` prints.

@@ -13,6 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from factored_polca.diagrams import Diagram
+from factored_polca.drawn import DrawnGraph
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.explicit.entropy_policy import EntropyPolicy
@@ -28,7 +29,7 @@ BeliefPolicy: TypeAlias = AlphaVectors | EntropyPolicy
 
 
 @dataclass(frozen=True)
-class SolvedPomdpTask:
+class SolvedPomdpTask(DrawnGraph):
     """What PolCA+ knows of a subtask when its parents are planned.
 
     `corner` [block] is what it chooses where it is certain of the block (0, the first action, where it has

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from factored_polca.diagrams import Diagram
+from factored_polca.drawn import DrawnGraph
 from factored_polca.hierarchy.counts import QValueCounts
 from factored_polca.minimisation import Reduction
 from factored_polca.models import Task
@@ -12,7 +13,7 @@ from factored_polca.solvers import MDPSolution
 
 
 @dataclass(frozen=True)
-class SolvedTask:
+class SolvedTask(DrawnGraph):
     """What PolCA knows of a subtask when its parents are planned.
 
     `policy` maps states to numbers of primitive actions; where it is not `defined` (the task has

@@ -19,10 +19,15 @@ from scipy import sparse
 
 from factored_polca.diagrams import INDEX, Diagram, Field, choose, evaluate_states, random_prime, relabel
 from factored_polca.explicit.arrays import ArrayMDP, FloatArray, IntArray
-from factored_polca.minimisation.criterion import DecisionProcess, ProcessView, common_denominator
+from factored_polca.minimisation.criterion import Choice, DecisionProcess, ProcessView, common_denominator
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
-from factored_polca.minimisation.quotient import feature_states, initial_distribution, make_quotient
+from factored_polca.minimisation.quotient import (
+    Quotient,
+    feature_states,
+    initial_distribution,
+    make_quotient,
+)
 from factored_polca.symbolic import NumericView
 
 
@@ -30,12 +35,14 @@ from factored_polca.symbolic import NumericView
 class InterchangeableQuotient:
     """An MDP over blocks whose actions are classes of equal signatures.
 
+    `named` is the quotient whose actions are the choices, each as at the representatives.
     `first[k, b]` is the first choice of class k in block b, -1 where the block has fewer classes;
     `signatures` [choice] are diagrams of sigma_a, `residues[k, b]` the value that class k has in b.
     """
 
     process: DecisionProcess
     partition: Partition
+    named: Quotient
     mdp: ArrayMDP
     first: IntArray
     signatures: tuple[Diagram, ...]
@@ -50,21 +57,36 @@ class InterchangeableQuotient:
 
         The leaf where there is no action is the number of the model's actions.
         """
-        symbolic, manager = self.process.symbolic, self.process.symbolic.manager
+        manager = self.process.symbolic.manager
+        result = manager.constant(len(self.process.symbolic.actions))
+        for choice, fits in reversed(self._fits(policy)):
+            taken = choice.policy
+            if taken is None:
+                taken = manager.constant(choice.primitives[0])
+            result = choose(fits, taken, result)
+        return result
+
+    def lift_choices(self, policy: IntArray) -> Diagram:
+        """A policy [block] -> class as a diagram of choices; no choice is the number of choices."""
+        manager = self.process.symbolic.manager
+        fitting = self._fits(policy)
+        result = manager.constant(len(fitting))
+        for number, (_, fits) in reversed(list(enumerate(fitting))):
+            result = choose(fits, manager.constant(number), result)
+        return result
+
+    def _fits(self, policy: IntArray) -> list[tuple[Choice, Diagram]]:
+        """For each choice where it has the signature of the class that the policy takes."""
         blocks = np.arange(self.partition.blocks)
         defined = policy >= 0
         wanted = np.where(defined, self.residues[np.maximum(policy, 0), blocks], 0).astype(np.uint64)
         leaf_type = self.signatures[0].leaf_type
         target = relabel(self.partition.diagram, np.append(wanted, np.uint64(0)), leaf_type)
         has_one = relabel(self.partition.diagram, np.append(defined, False).astype(np.uint64), INDEX)
-        result = manager.constant(len(symbolic.actions))
-        for choice, signature in reversed(list(zip(self.process.choices, self.signatures, strict=True))):
-            fits = has_one & choice.app & signature.equals(target)
-            taken = choice.policy
-            if taken is None:
-                taken = manager.constant(choice.primitives[0])
-            result = choose(fits, taken, result)
-        return result
+        return [
+            (choice, has_one & choice.app & signature.equals(target))
+            for choice, signature in zip(self.process.choices, self.signatures, strict=True)
+        ]
 
 
 def interchangeable_quotient(
@@ -87,11 +109,12 @@ def interchangeable_quotient(
     memo: dict[int, Diagram] = {}
     signatures = tuple(polynomial.signature(choice, value, memo) for choice in process.choices)
     states, columns = feature_states(partition), process.symbolic.columns()
-    named = make_quotient(process, partition).mdp
+    quotient = make_quotient(process, partition)
+    named = quotient.mdp
     values = np.stack([evaluate_states(s, states, columns) for s in signatures]).astype(np.uint64)
     first, residues = _classes(values, named.applicable)
     return InterchangeableQuotient(
-        process, partition, _exchanged(named, first), first, signatures, residues
+        process, partition, quotient, _exchanged(named, first), first, signatures, residues
     )
 
 

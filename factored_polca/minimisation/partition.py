@@ -25,11 +25,12 @@ from factored_polca.diagrams import (
     states_for_leaves,
     states_of_leaves,
 )
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.symbolic import SymbolicModel
 
 
 @dataclass(frozen=True)
-class Partition:
+class Partition(Drawn, Framed):
     """Blocks 0 .. blocks-1; the leaf `blocks` is outside, where `has_outside`."""
 
     symbolic: SymbolicModel
@@ -39,7 +40,7 @@ class Partition:
 
     @cached_property
     def representatives(self) -> npt.NDArray[np.int32]:
-        """The first state of each block: value numbers int32 [block, level]."""
+        """The first state of each block, as value numbers int32 [block, level]."""
         states = states_for_leaves(self.diagram)
         result = np.zeros((self.blocks, self.symbolic.manager.leaf_level), dtype=np.int32)
         for state, leaf in zip(states, leaves(self.diagram), strict=True):

@@ -67,13 +67,14 @@ def refuse_partial(process: DecisionProcess) -> None:
         ModelError: it is not.
     """
     if process.partial:
-        raise ModelError(
-            [
-                Fault(
-                    "interchangeable actions need a state that is seen: who does not know the state does "
-                    "not know which of them fits",
-                    ("observability",),
-                    "minimise with named actions",
-                )
-            ]
-        )
+        raise ModelError([interchangeable_fault()])
+
+
+def interchangeable_fault() -> Fault:
+    """Why actions of a model whose state is not seen can't be exchanged."""
+    return Fault(
+        "interchangeable actions need a state that is seen: who does not know the state does not know "
+        "which of them fits",
+        ("observability",),
+        "minimise with named actions",
+    )

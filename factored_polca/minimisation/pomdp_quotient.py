@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from factored_polca.diagrams import evaluate_states
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.arrays import ArrayMDP, BoolArray
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
@@ -53,7 +54,7 @@ MAXIMUM_ENTRIES: Final = 20_000_000
 
 
 @dataclass(frozen=True)
-class PomdpQuotient:
+class PomdpQuotient(DrawnGraph, Framed):
     """A POMDP over blocks, and what its exact rows are made from.
 
     `primitive[c, b]` is the primitive that choice c stands for in block b, -1 where b is terminal.

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from factored_polca.diagrams import evaluate_states
+from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.arrays import ArrayMDP
 from factored_polca.minimisation.criterion import Choice, DecisionProcess
 from factored_polca.minimisation.partition import Partition
@@ -41,7 +42,7 @@ from factored_polca.symbolic.floats import as_float
 
 
 @dataclass(frozen=True)
-class Quotient:
+class Quotient(DrawnGraph, Framed):
     """A decision process over blocks, and what its exact rows are made from.
 
     `primitive[c, b]` is the primitive that choice c stands for in block b, -1 where not applicable.

@@ -18,7 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, INDEX, Diagram, at, choose, evaluate_states, relabel
+from factored_polca.drawn import DrawnGraph, Framed
+from factored_polca.explicit.arrays import ArrayMDP
 from factored_polca.minimisation.criterion import DecisionProcess
+from factored_polca.minimisation.interchangeable import InterchangeableQuotient, interchangeable_quotient
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.pomdp_quotient import (
     MAXIMUM_OBSERVATIONS,
@@ -31,7 +34,7 @@ from factored_polca.models import Value
 
 
 @dataclass(frozen=True)
-class Reduction:
+class Reduction(DrawnGraph, Framed):
     """A minimised decision process: the partition, the quotient, and how to get there and back."""
 
     minimisation: Minimisation
@@ -47,6 +50,17 @@ class Reduction:
         if not isinstance(self.quotient, PomdpQuotient):
             raise TypeError("the process is fully observed; `quotient.mdp` is what it became")
         return self.quotient
+
+    @property
+    def mdp(self) -> ArrayMDP:
+        """What is to be solved of a fully observed process.
+
+        Raises:
+            TypeError: the process is partially observed.
+        """
+        if isinstance(self.quotient, PomdpQuotient):
+            raise TypeError("the process is partially observed; `pomdp_quotient` is what it became")
+        return self.quotient.mdp
 
     @property
     def process(self) -> DecisionProcess:
@@ -123,6 +137,29 @@ class Reduction:
         return relabel(self.partition.diagram, np.append(images, np.uint64(none)), INDEX)
 
 
+@dataclass(frozen=True)
+class InterchangeableReduction(Reduction):
+    """A reduction by what actions do, whatever their names; a policy takes classes of equal signatures.
+
+    The quotient is that of the named actions of representatives; `exchanged.mdp` is to be solved.
+    """
+
+    exchanged: InterchangeableQuotient
+
+    @property
+    def mdp(self) -> ArrayMDP:
+        """The MDP whose actions are classes."""
+        return self.exchanged.mdp
+
+    def lift_policy(self, policy: npt.NDArray[Any]) -> Diagram:
+        """A policy [block] -> class (-1: none) as a diagram of primitive action numbers."""
+        return self.exchanged.lift_policy(policy)
+
+    def lift_choices(self, policy: npt.NDArray[Any]) -> Diagram:
+        """A policy [block] -> class as an index diagram; no choice is the number of choices."""
+        return self.exchanged.lift_choices(policy)
+
+
 def reduce(
     process: DecisionProcess,
     *,
@@ -131,16 +168,24 @@ def reduce(
     block_limit: int | None = None,
     progress: Progress | None = None,
     maximum_observations: int = MAXIMUM_OBSERVATIONS,
+    interchangeable: bool = False,
 ) -> Reduction:
     """Minimise a decision process and build its quotient; see `minimise` and `make_pomdp_quotient`.
 
+    With `interchangeable` the answer is an `InterchangeableReduction`.
+
     Raises:
+        ModelError: interchangeable actions of a partially observed process.
         LimitReached: also where a choice of a partially observed process has more than
             `maximum_observations` joint observations.
     """
     found = minimise(
-        process, seed=seed, confirmations=confirmations, block_limit=block_limit, progress=progress
-    )
+        process, seed=seed, confirmations=confirmations, block_limit=block_limit, progress=progress,
+        interchangeable=interchangeable,
+    )  # fmt: skip
+    if interchangeable:
+        exchanged = interchangeable_quotient(process, found.partition, seed=seed)
+        return InterchangeableReduction(found, exchanged.named, exchanged)
     if process.partial:
         quotient = make_pomdp_quotient(
             process, found.partition, maximum_observations=maximum_observations, seed=seed

@@ -60,6 +60,7 @@ from factored_polca.diagrams import (
     relabel,
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.minimisation.criterion import (
     DecisionProcess,
     ProcessView,
@@ -85,7 +86,7 @@ EARLY = 3
 
 
 @dataclass(frozen=True)
-class Minimisation:
+class Minimisation(Drawn, Framed):
     """A partition and how it was found.
 
     `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the

@@ -21,6 +21,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any, Literal
 
+from factored_polca.drawn import DrawnGraph
 from factored_polca.models.expressions import (
     FALSE,
     TRUE,
@@ -118,7 +119,7 @@ class InitialBelief:
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(DrawnGraph):
     """A factored MDP or POMDP; see the module's docstring for the letters.
 
     Names inside expressions are resolved on construction as far as they are known (features,
@@ -175,7 +176,7 @@ class Model:
 
     @property
     def states(self) -> int:
-        """The number of states: the full product, terminal and unreachable ones included."""
+        """The number of states in the full product, terminal and unreachable ones included."""
         return math.prod(len(feature.values) for feature in self.features)
 
     def feature(self, name: str) -> Feature:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from factored_polca.drawn import DrawnGraph
 from factored_polca.models.expressions import FALSE, Expression, ExpressionLike, as_expression
 from factored_polca.models.model import Model, _terms, resolve
 
@@ -64,7 +65,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class TaskHierarchy:
+class TaskHierarchy(DrawnGraph):
     """The tasks of a hierarchy, in any order."""
 
     tasks: tuple[Task, ...]

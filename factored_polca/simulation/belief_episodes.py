@@ -53,18 +53,23 @@ def run_one_by_one(
         ImpossibleObservation: a belief has lost the true state, and the tracker was not told to reset.
         LimitReached: a belief no longer fits (diagrams only).
     """
-    width = DIAGRAM_NUMBERS
-    if isinstance(tracker, ParticleTracker):
-        width = tracker.count * len(tracker.symbolic.model.features)
     return run_episodes(
         World(tracker.symbolic, whole_model(tracker.symbolic)),
         lambda count: _SingleMinds(tracker, decide, count),
         episodes=episodes,
         steps=steps,
         seed=seed,
-        at_once=max(1, BELIEF_NUMBERS // width),
+        at_once=episodes_at_once(tracker),
         progress=progress,
     )
+
+
+def episodes_at_once(tracker: Tracker) -> int:
+    """How many episodes run side by side."""
+    width = DIAGRAM_NUMBERS
+    if isinstance(tracker, ParticleTracker):
+        width = tracker.count * len(tracker.symbolic.model.features)
+    return max(1, BELIEF_NUMBERS // width)
 
 
 class _SingleMinds:

@@ -31,6 +31,7 @@ import numpy as np
 from factored_polca.control.belief_policies import BlockPolicy, holds
 from factored_polca.control.block_tracker import BlockTracker
 from factored_polca.diagrams import Diagram, evaluate_states
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.models import ModelError
@@ -60,7 +61,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class BeliefRuns:
+class BeliefRuns(Drawn, Framed):
     """What episodes earned.
 
     `returns` [episode] are discounted.  `cumulative` and `cumulative_error` [step] are the mean of what has

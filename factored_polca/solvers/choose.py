@@ -41,7 +41,7 @@ def solve_mdp(
 ) -> MDPSolution:
     """Bounds on the optimal values of `mdp`, and a policy.
 
-    Stops when upper - lower <= epsilon * max(1, max |value|) in every state, at `deadline` (a reading
+    Stops when upper - lower <= `epsilon * max(1, max |value|)` in every state, at `deadline` (a reading
     of `time.monotonic()`), after `iterations`, or on Ctrl-C; the bounds hold in each case.
     `progress(iterations, gap)` is called between passes.  `describe(s)` names a state in errors.
 

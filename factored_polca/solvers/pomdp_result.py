@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.alpha_vectors import AlphaVectors, StagedVectors
 from factored_polca.explicit.arrays import FloatArray
 from factored_polca.explicit.entropy_policy import EntropyPolicy
@@ -58,7 +59,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class POMDPSolution:
+class POMDPSolution(Drawn, Framed):
     """Bounds on V*(b0), and a policy.
 
     `lower <= V*(b0) <= upper`, whatever the `status`, rounding included.  `lower` is also at most what

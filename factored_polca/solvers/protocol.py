@@ -45,7 +45,7 @@ class PomdpSolver(Protocol):
 class MdpSolver(Protocol):
     """Solves a fully observed problem.
 
-    Asked for is upper - lower <= demand.gap * max(1, max |value|) in each state.
+    Asked for is upper - lower <= `demand.gap * max(1, max |value|)` in each state.
     """
 
     def __call__(self, mdp: ArrayMDP, demand: Demand) -> MDPSolution:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 
 GuaranteeKind = Literal["exact", "bounds", "heuristic", "statistical"]
@@ -25,7 +26,7 @@ class Guarantee:
 
 
 @dataclass(frozen=True)
-class MDPSolution:
+class MDPSolution(Drawn, Framed):
     """Bounds on the optimal value of every state, and a policy.
 
     `lower <= V* <= upper` holds in every state whatever the `status`, rounding included (see

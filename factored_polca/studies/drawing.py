@@ -11,10 +11,12 @@ import os
 import secrets
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from factored_polca.display.extras import MissingLibrary, library
+from factored_polca.display.plots import COLOURS, figure_4a, figure_4b, tidy
 from factored_polca.formats import destination
 from factored_polca.studies.parameters import ParameterStudy, Reading
 from factored_polca.studies.perturbations import PerturbationStudy
@@ -22,23 +24,16 @@ from factored_polca.studies.rewards import PAIRS, RewardStudy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-COLOURS: Final = {  # Okabe & Ito's, which the colour-blind tell apart
-    "none": "#8c8c8c", "polca": "#e69f00", "polca_plus": "#0072b2",
-    "PolCA+": "#0072b2", "PolCA": "#e69f00", "QMDP": "#d55e00", "SARSOP": "#009e73",
-}  # fmt: skip
+__all__ = [
+    "MissingLibrary", "draw_parameters", "draw_perturbations", "draw_rewards", "require_matplotlib",
+    "write_drawing",
+]  # fmt: skip
 
-READINGS: Final[tuple[tuple[Reading, str], ...]] = (
-    ("none", "no abstraction"),
-    ("polca", "PolCA"),
-    ("polca_plus", "PolCA+"),
-)
+ALL_READINGS: Final[tuple[Reading, ...]] = ("none", "polca", "polca_plus")
 
 DOTS_PER_INCH: Final = 150
-
-
-class MissingLibrary(Exception):
-    """A library of an optional extra is not installed; the message says how to install it."""
 
 
 def require_matplotlib() -> None:
@@ -47,12 +42,7 @@ def require_matplotlib() -> None:
     Raises:
         MissingLibrary: matplotlib is not installed.
     """
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise MissingLibrary(
-            "drawing needs matplotlib, which is not installed: pip install 'factored-polca[viz]'"
-        ) from None
+    library("matplotlib.figure", "viz", "drawing")
 
 
 def write_drawing(
@@ -65,12 +55,25 @@ def write_drawing(
         ModelError: no such folder, or no regular file in the file's place.
         OSError: the file can't be written.
     """
+    write_figure(path, lambda figure: draw(figure.add_subplot()), width=width, height=height)
+
+
+def write_figure(
+    path: str | Path, fill: Callable[[Figure], object], *, width: float, height: float
+) -> None:
+    """Write a figure of several drawings, which `fill` makes, as a PNG; else like `write_drawing`.
+
+    Raises:
+        MissingLibrary: matplotlib is not installed.
+        ModelError: no such folder, or no regular file in the file's place.
+        OSError: the file can't be written.
+    """
     require_matplotlib()
     from matplotlib.figure import Figure
 
     target = destination(path)
     figure = Figure(figsize=(width, height), layout="constrained")
-    draw(figure.add_subplot())
+    fill(figure)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
     temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
@@ -83,66 +86,21 @@ def write_drawing(
 
 def draw_parameters(study: ParameterStudy, ax: Axes) -> Axes:
     """Figure 4a: bars on a logarithmic scale, three for each task and for all together."""
-    names = [*(task.name for task in study.tasks), "all"]
-    places, width = np.arange(len(names)), 0.27
-    for number, (reading, label) in enumerate(READINGS):
-        counts = [*(getattr(task, reading) for task in study.tasks), study.total(reading)]
-        known = [k for k, count in enumerate(counts) if count]
-        if not known:
-            continue
-        heights = [counts[k] for k in known]
-        bars = ax.bar(
-            places[known] + (number - 1) * width, heights, 0.92 * width, color=COLOURS[reading], label=label
-        )
-        ax.bar_label(bars, [_short(n) for n in heights], fontsize=7, color="#404040", padding=1.5)
-    ax.set_yscale("log")
-    _, high = ax.get_ylim()
-    ax.set_ylim(10, 2 * high)
-    ax.axvline(len(names) - 1.5, color="#c0c0c0", linewidth=0.8)
-    ax.set_xticks(places, names)
-    ax.tick_params(axis="x", length=0)
-    ax.set_ylabel("parameters (non-zero entries)")
-    ax.set_title(f"{study.model}: parameters of the tasks' models", loc="left")
-    return _tidy(ax, legend="upper left", columns=3)
+    counts: list[tuple[str, dict[str, int | None]]] = [
+        (task.name, {"none": task.none, "polca": task.polca, "polca_plus": task.polca_plus})
+        for task in study.tasks
+    ]
+    counts.append(("all", {reading: study.total(reading) for reading in ALL_READINGS}))
+    figure_4a(counts, ax, title=f"{study.model}: parameters of the tasks' models")
+    ax.axvline(len(counts) - 1.5, color="#c0c0c0", linewidth=0.8)
+    return ax
 
 
 def draw_rewards(study: RewardStudy, ax: Axes) -> Axes:
     """Figure 4b: mean cumulative reward by time, in a band of one standard error on either side."""
-    time = np.arange(1, study.steps + 1)
-    for one in study.earned:
-        colour = COLOURS[one.name]
-        ax.plot(time, one.cumulative, color=colour, linewidth=1.6, label=one.name)
-        low, high = one.cumulative - one.cumulative_error, one.cumulative + one.cumulative_error
-        ax.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
-    ax.axhline(0, color="#c0c0c0", linewidth=0.8, zorder=0)
-    ax.set_xlim(0, study.steps)
-    _name_curves(study, ax)
-    ax.set_xlabel("steps")
-    ax.set_ylabel("cumulative reward")
-    ax.set_title(
-        f"{study.model}: cumulative reward, mean ± standard error of {study.episodes:,} episodes",
-        loc="left",
-    )
-    return _tidy(ax)
-
-
-def _name_curves(study: RewardStudy, ax: Axes) -> None:
-    """The names of the curves at their right ends, moved apart where they would overlap."""
-    low, high = ax.get_ylim()
-    room = 0.055 * (high - low)
-    ends = sorted(study.earned, key=lambda one: float(one.cumulative[-1]))
-    levels = [float(one.cumulative[-1]) for one in ends]
-    for k in range(1, len(levels)):
-        levels[k] = max(levels[k], levels[k - 1] + room)
-    ceiling = high
-    for k in reversed(range(len(levels))):
-        levels[k] = min(levels[k], ceiling)
-        ceiling = levels[k] - room
-    for one, level in zip(ends, levels, strict=True):
-        ax.annotate(
-            one.name, (1, level), xycoords=("axes fraction", "data"), xytext=(5, 0),
-            textcoords="offset points", color=COLOURS[one.name], va="center", fontweight="bold",
-        )  # fmt: skip
+    curves = {one.name: (one.cumulative.tolist(), one.cumulative_error.tolist()) for one in study.earned}
+    episodes = f"mean ± standard error of {study.episodes:,} episodes"
+    return figure_4b(curves, ax, title=f"{study.model}: cumulative reward, {episodes}")
 
 
 def draw_perturbations(study: PerturbationStudy, ax: Axes) -> Axes:
@@ -168,21 +126,4 @@ def draw_perturbations(study: PerturbationStudy, ax: Axes) -> Axes:
         "standard errors",
         loc="left",
     )
-    return _tidy(ax, legend="upper left", columns=len(PAIRS))
-
-
-def _tidy(ax: Axes, legend: Literal["upper left"] | None = None, columns: int = 1) -> Axes:
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    ax.grid(axis="y", color="#e4e4e4", linewidth=0.7)
-    ax.set_axisbelow(True)
-    if legend is not None:
-        ax.legend(loc=legend, frameon=False, ncols=columns, fontsize=9)
-    return ax
-
-
-def _short(count: int) -> str:
-    """A count in two or three digits."""
-    if count < 1000:
-        return f"{count}"
-    return f"{count / 1000:.1f}k" if count < 10_000 else f"{count / 1000:.0f}k"
+    return tidy(ax, legend="upper left", columns=len(PAIRS))

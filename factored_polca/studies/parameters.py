@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
+from factored_polca.drawn import Framed
 from factored_polca.hierarchy import HierarchicalPlan, Options, plan_mdp, plan_pomdp
 from factored_polca.hierarchy.parameters import pomdp_parameters, unreduced_parameters
 from factored_polca.hierarchy.pomdp_report import polca_parameters
@@ -41,7 +42,7 @@ class TaskParameters:
 
 
 @dataclass(frozen=True)
-class ParameterStudy:
+class ParameterStudy(Framed):
     """The parameters of all tasks, children first; `notes` say what was left out, and why."""
 
     model: str

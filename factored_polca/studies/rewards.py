@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from factored_polca.drawn import Framed
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.hierarchy import Options
 from factored_polca.models import Model, TaskHierarchy
@@ -72,7 +73,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class RewardStudy:
+class RewardStudy(Framed):
     """What each policy earned on one model, and the differences."""
 
     model: str

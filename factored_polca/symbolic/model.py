@@ -39,6 +39,7 @@ from factored_polca.models.expressions import ZERO, Expression, Reference, refer
 from factored_polca.models.scalars import Undefined, describe
 from factored_polca.symbolic.expressions import Distribution, ExpressionCompiler, Variable, row_of, used
 from factored_polca.symbolic.initial import compile_initial
+from factored_polca.symbolic.names import LevelNames
 from factored_polca.symbolic.observations import (
     compile_observations,
     expect_observations,
@@ -166,6 +167,7 @@ def compile_model(
     sizes += [len(channel.values) for channel in model.observations]
     manager = Manager(sizes, memory_limit=memory_limit)
     manager.deadline = deadline
+    manager.describe = LevelNames(model, names).describe
     levels = {
         Reference(name, primed): 2 * position[index] + primed
         for name, index in features.items()
@@ -268,11 +270,8 @@ class _Build:
         self.faults.append(Fault(f"{what} is wrong{where}: {reason}", path, hint=f"needed is {wanted}"))
 
     def level_text(self, level: int, value: int) -> str:
-        if level >= 2 * len(self.order):
-            channel = self.model.observations[level - 2 * len(self.order)]
-            return f"{channel.name}={_show(channel.values[value])}"
-        feature = self.model.feature(self.order[level // 2])
-        return f"{feature.name}{chr(39) if level % 2 else ''}={_show(feature.values[value])}"
+        name, values = LevelNames(self.model, self.order).describe(level)
+        return f"{name}={_show(values[value])}"
 
     # -- actions ---------------------------------------------------------------------------
 
