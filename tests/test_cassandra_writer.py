@@ -78,6 +78,21 @@ def test_a_quotient_keeps_the_value_of_its_model(seed: int, tmp_path: Path) -> N
     assert value(back) == pytest.approx(value(arrays), abs=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(0, 60, 6))
+def test_a_quotient_in_pomdpx_keeps_the_value_of_its_model(seed: int, tmp_path: Path) -> None:
+    model = random_pomdp(seed)
+    if any(feature.observed for feature in model.features):
+        model = foretold(model)
+    path = tmp_path / "q.pomdpx"
+    reduce(flat_process(compile_model(model))).pomdp_quotient.to_pomdpx(path)
+    back = enumerate_pomdp(files.read(path).model).to_arrays()
+    assert value(back) == pytest.approx(value(enumerate_pomdp(model).to_arrays()), abs=1e-9)
+    seen = random_model(seed, inapplicable=False, max_states=40)
+    reduce(flat_process(compile_model(seen))).quotient.to_pomdpx(path)
+    back = enumerate_pomdp(files.read(path).model).to_arrays()
+    assert value(back) == pytest.approx(value(enumerate_pomdp(seen).to_arrays()), abs=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(0, 20, 2))
 def test_a_quotient_of_an_mdp_keeps_the_value_of_its_model(seed: int, tmp_path: Path) -> None:
     model = random_model(seed, inapplicable=False, max_states=40)

@@ -133,6 +133,27 @@ def test_vectors_come_back_as_a_policy_with_bounds_of_our_own(
     assert "problem.pomdp" in seen.splitlines()[-1]
 
 
+# The end of what pomdpsol prints for the tiger.
+TABLE = """
+ Time   |#Trial |#Backup |LBound    |UBound    |Precision  |#Alphas |#Beliefs
+-------------------------------------------------------------------------------
+ 0       0       0        -20        92.8205    112.821     3        1
+ 0.01    18      78       19.3713    19.3723    0.000983243 29       19
+-------------------------------------------------------------------------------
+"""
+
+
+def test_what_pomdpsol_says_of_its_bounds_is_told_as_its_claim(folder: Path) -> None:
+    program(folder, "pomdpsol", f"print({TABLE!r}); Path(out).write_text({POLICY!r})")
+    found = call_pomdp_solver(Sarsop(), TIGER, Demand(gap=1e-3))
+    assert "it claims 19.3713 .. 19.3723 at the start" in found.note
+    assert found.upper > 19.3723  # ours is what we can prove of the policy
+    liar = TABLE.replace("19.3723", "1e-3")
+    program(folder, "pomdpsol", f"print({liar!r}); Path(out).write_text({POLICY!r})")
+    again = call_pomdp_solver(Sarsop(), TIGER, Demand(gap=1e-3))
+    assert (again.lower, again.upper) == (found.lower, found.upper)
+
+
 def test_promises_are_not_believed(folder: Path) -> None:
     program(folder, "pomdp-solve", "Path(out).write_text('1\\n1000 1000\\n')")
     found = call_pomdp_solver(PomdpSolve(), TIGER, Demand(gap=1e-3))

@@ -1169,3 +1169,11 @@ def agree_on_hallway(text: str, model: Model) -> None:
             assert distribution(action.senses[0][1], seen, next_) == tuple(p / sum(row) for p in row)
             terms = [evaluate(term, {**here, **next_}) for term in (*model.rewards, *action.rewards)]
             assert sum(terms) == tables["reward_agent"].get((action.name, s), zero)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["\x9b2J", "\u200b", "\u202eb"])
+def test_a_name_that_is_not_seen_is_refused(name: str) -> None:
+    text = TIGER.replace("<ValueEnum>", f"<ValueEnum>{name} ", 1)
+    with pytest.raises(ModelError, match="a character that can't be shown") as caught:
+        read_pomdpx(text, "m")
+    assert str(caught.value).isprintable()

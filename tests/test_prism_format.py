@@ -370,7 +370,7 @@ def dynamics(mdp: ExactMDP, code: dict[str, dict[object, object]]) -> dict[objec
 
 
 @with_storm
-@pytest.mark.parametrize("seed", range(14))
+@pytest.mark.parametrize("seed", range(10))
 def test_a_model_that_is_written_and_read_is_the_same(seed: int) -> None:
     model = random_model(seed, parameters=seed % 2 == 0, max_states=100)
     model = replace_fields(model, initial=InitialBelief())

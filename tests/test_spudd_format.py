@@ -561,8 +561,9 @@ def test_an_initial_network_with_thirds_keeps_its_conditional_weights() -> None:
 def test_names_that_the_language_lacks_are_replaced_and_told() -> None:
     features = [Feature("my place", [-1, 0, 1]), boolean("cost"), Feature("my_place", ["a b", "a_b", "2"])]
     model = Model(
-        "a\nb}", features, [Action("go!", {"cost": True}), Action("go?")], rewards="`my place` * 2"
-    )
+        "a}", features, [Action("go!", {"cost": True}), Action("go?")], rewards="`my place` * 2",
+        description="two\nlines}",
+    )  # fmt: skip
     text = write_spudd(model)
     again = read_spudd(text, "m")
     assert [f.name for f in again.features] == ["my_place_2", "cost_2", "my_place"]

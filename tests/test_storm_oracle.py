@@ -28,11 +28,11 @@ from factored_polca.models.scalars import scalar
 from factored_polca.solvers import solve_mdp
 from factored_polca.symbolic import compile_model, reachable_states
 
-PROGRAMS = range(32)
+PROGRAMS = range(24)
 BLOCKS = [
     seed for seed in range(112) if seed not in (16, 45)
 ]  # which need floor(): Storm's exact quotient has none
-VALUES = range(200, 240)
+VALUES = range(200, 224)
 
 
 def choices_of(model: Model) -> dict[storm_peer.State, storm_peer.Choices]:

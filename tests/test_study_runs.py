@@ -140,16 +140,15 @@ def test_what_takes_too_much_is_stopped_and_the_rest_goes_on() -> None:
         function("wordy"),
         function("no_such"),
         function("square", set={"m": 1}),
-        {"work": "plan", "model": "taxi", "set": {"size": 10**6}},
         function("square", set={"n": [3, 4]}),
     ], seconds=12, memory_bytes=230 * MIB, jobs=3)  # fmt: skip
     assert study.run(jobs=3).left == 0
     rows = study.rows()
     assert [row["status"] for row in rows] == [
-        "ok", "ok", "memout", "timeout", "memout", *["error"] * 7, "ok", "ok",
+        "ok", "ok", "memout", "timeout", "memout", *["error"] * 6, "ok", "ok",
     ]  # fmt: skip
     assert [row["square"] for row in rows if row["status"] == "ok"] == [1, 4, 9, 16]
-    hungry, asleep, children, broken, crashed, left, wordy, missing, arguments, taxi = rows[2:12]
+    hungry, asleep, children, broken, crashed, left, wordy, missing, arguments = rows[2:11]
     for row in (hungry, children):
         assert row["peak_memory_bytes"] > 230 * MIB
         assert "the limit is 230 MiB" in row["message"]
@@ -162,7 +161,6 @@ def test_what_takes_too_much_is_stopped_and_the_rest_goes_on() -> None:
     assert "answered str" in wordy["message"]
     assert "no function no_such" in missing["message"]
     assert arguments["message"].startswith("TypeError")
-    assert "size" in taxi["message"]
 
 
 def test_a_raised_limit_runs_again_what_had_met_it_and_nothing_else() -> None:
@@ -371,10 +369,10 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return table(study)
 
 
-@pytest.mark.parametrize("kind", [ThreadPoolExecutor, ProcessPoolExecutor])
-def test_an_executor_gives_the_same_table(local: list[dict[str, Any]], kind: Any) -> None:
+@pytest.mark.parametrize(("kind", "workers"), [(ThreadPoolExecutor, 2), (ProcessPoolExecutor, 1)])
+def test_an_executor_gives_the_same_table(local: list[dict[str, Any]], kind: Any, workers: int) -> None:
     study = same("elsewhere")
-    with kind(2) as executor:
+    with kind(workers) as executor:
         study.run(executor=executor, jobs=4)
     assert table(study) == local
 

@@ -19,6 +19,7 @@ from factored_polca.explicit.exact_pomdp import ExactPOMDP, enumerate_pomdp
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats.native import read_native, write_native
 from factored_polca.minimisation import outcomes
+from factored_polca.minimisation.flat_model import flat_model
 from factored_polca.minimisation.outcomes import Numbering
 from factored_polca.minimisation.unreduced import unreduced, unreduced_mdp, unreduced_pomdp
 from factored_polca.models import (
@@ -438,3 +439,14 @@ def test_an_action_that_does_not_apply_everywhere_is_refused() -> None:
     assert caught.value.faults[0].path == ("actions", "up", "applicable")
     ended = replace(model, terminal="x == 1")
     assert flat(ended).kernel[1][0].toarray().tolist() == [[0, 1], [0, 0]]
+
+
+@pytest.mark.parametrize("observability", ["full", "partial"])
+def test_a_reward_that_no_float_holds_is_refused_by_its_action(observability: str) -> None:
+    """A number of a file may have 400 digits before the point; floats end at 1.8e308."""
+    x = boolean("x")
+    model = Model(
+        "m", [x], [Action("a", rewards="1e399 if x else 0")], discount="0.9", observability=observability
+    )
+    with pytest.raises(ModelError, match=r"action 'a' has a reward beyond 10\^200"):
+        flat_model(compile_model(model), reachable=False)

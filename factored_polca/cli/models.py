@@ -291,7 +291,7 @@ def write_flat(
     """Write a model state by state, those that the start can reach; how many."""
     from factored_polca.cli.commands import compile_kernels
     from factored_polca.formats.array_fields import pomdp_fields, write_npz
-    from factored_polca.formats.cassandra import write_pomdp
+    from factored_polca.formats.cassandra import plainly_labelled, write_pomdp
     from factored_polca.formats.files import write_text
     from factored_polca.minimisation.flat_model import flat_model
     from factored_polca.symbolic import compile_model
@@ -305,8 +305,8 @@ def write_flat(
     else:
         texts = [flat.state_text(state) for state in range(count)]
         first = arguments.first_step and not flat.fully_observed
-        name = source.model.name
-        write_text(arguments.output, lambda: write_pomdp(flat.pomdp, name, texts, first_step=first))
+        name, pomdp = source.model.name, plainly_labelled(flat.pomdp, source.model)
+        write_text(arguments.output, lambda: write_pomdp(pomdp, name, texts, first_step=first))
     return {"listed": count}
 
 

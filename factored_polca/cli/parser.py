@@ -122,6 +122,10 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
     sub.add_argument(
+        "--discount", type=discount, metavar="D",
+        help="plan without end, with this discount: in place of the model's discount and horizon",
+    )  # fmt: skip
+    sub.add_argument(
         "--solver", default="auto", type=solver, metavar="NAME",
         help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has; or "
         "package.module:Name, which is imported",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from factored_polca.cli.commands import (
@@ -17,6 +18,7 @@ from factored_polca.cli.commands import (
 from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
 from factored_polca.cli.source import Source, load
 from factored_polca.models import LimitReached, ModelError
+from factored_polca.models.model import replace_fields
 
 if TYPE_CHECKING:
     from factored_polca.hierarchy import HierarchicalPlan, Options, PomdpPlan
@@ -31,6 +33,7 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     if arguments.output is not None:
         refuse_unwritable(arguments.output)
     source = load(arguments.model, arguments.set, arguments.tasks)
+    source = overridden(source, arguments, output)
     partial = source.model.observability == "partial" and not arguments.polca
     if arguments.polca and source.model.observability == "full":
         output.note("the state is seen: --polca changes nothing")
@@ -47,6 +50,19 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     if arguments.output is not None:
         output.note(f"plan written to {arguments.output}; try: factored-polca simulate {arguments.output}")
     return 0
+
+
+def overridden(source: Source, arguments: argparse.Namespace, output: Output) -> Source:
+    """The model with the discount that is asked for, and without a horizon; says what it had."""
+    if arguments.discount is None:
+        return source
+    model = source.model
+    steps = "" if model.horizon is None else f" over {model.horizon:,} steps"
+    output.warn(
+        f"{source.name}: planned without end at discount {arguments.discount}, in place of the model's "
+        f"discount {model.discount}{steps}"
+    )
+    return replace(source, model=replace_fields(model, discount=arguments.discount, horizon=None))
 
 
 def options_of(arguments: argparse.Namespace) -> Options:
@@ -149,8 +165,6 @@ def plan_partial(
 
 def planned_as_seen(source: Source, options: Options, output: Output) -> HierarchicalPlan | None:
     """The same hierarchy planned as if the state were seen, for comparison; None where PolCA can't."""
-    from dataclasses import replace
-
     from factored_polca.hierarchy import plan_mdp
 
     try:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from factored_polca import library
 from factored_polca.formats import FORMATS, read
+from factored_polca.formats.files import parts
 from factored_polca.models import Fault, Feature, Model, ModelError, TaskHierarchy, Value
 
 
@@ -52,7 +53,8 @@ def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> S
     locate: Callable[[Iterable[Fault]], tuple[Fault, ...]] = tuple
     if path.is_file() or path.suffix.lower() in FORMATS or path.is_dir():
         document = read(path, parameters)
-        name, model, hierarchy, warnings = path.name, document.model, document.tasks, document.warnings
+        name = "+".join(part.name for part in parts(text))
+        model, hierarchy, warnings = document.model, document.tasks, document.warnings
         locate = document.locate
     elif text in library.domains():
         domain = library.load(text, parameters)
@@ -103,13 +105,17 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
     return result
 
 
+_LISTED = re.compile(r"(?:\([^()]*\)|[^,(]|\()+")
+"""Names with commas between them; a comma in parentheses is part of a name, as in move(x1,y2)."""
+
+
 def parse_actions(text: str, model: Model) -> list[str]:
-    """`a,b` as the names of actions, in the model's order.
+    """`a,b` or `move(x1,y2),noop` as the names of actions, in the model's order.
 
     Raises:
         UsageError: an unknown action; the message lists those there are.
     """
-    asked = {name.strip() for name in text.split(",")}
+    asked = {name.strip() for name in _LISTED.findall(text) if name.strip()} or {""}
     known = [action.name for action in model.actions]
     unknown = sorted(asked - set(known))
     if unknown:

@@ -9,7 +9,7 @@
 The program is started without a shell in a temporary folder, on a file written from the arrays, and ended,
 with what it started, after a time limit: the demand's deadline, or `seconds`. Only its policy is used: its
 vectors are read back, brought to the original states and evaluated here, so that no bound is taken on
-trust (`factored_polca.solvers.proposal`).
+trust (`factored_polca.solvers.proposal`).  The bounds that pomdpsol prints stand in the note, as its claim.
 """
 
 from __future__ import annotations
@@ -104,6 +104,23 @@ class Sarsop:
 
 Read = Callable[[Path, int], tuple[FloatArray, IntArray]]
 
+_NUMBER: Final = r"(-?[0-9.]+(?:e[-+]?[0-9]+)?)"
+_BOUNDS: Final = re.compile(
+    rf"^ *{_NUMBER} +\d+ +\d+ +{_NUMBER} +{_NUMBER} +{_NUMBER} +\d+ +\d+ *$", re.MULTILINE
+)
+"""A line of pomdpsol's table: time, trials, backups, lower and upper bound, precision, vectors, beliefs."""
+
+
+def claim(printed: str) -> str:
+    """What pomdpsol says of the value at the start: words for a note, "" if it says nothing.
+
+    It is the program's word, of its own arithmetic: it goes into no bound of ours.
+    """
+    found = _BOUNDS.findall(printed)
+    return (
+        f"; it claims {float(found[-1][1]):.9g} .. {float(found[-1][2]):.9g} at the start" if found else ""
+    )
+
 
 def _solved(
     program: str,
@@ -143,7 +160,8 @@ def _solved(
     return solution_of_policy(
         pomdp, policy, method=program, demand=demand, roots=roots, seconds=time.perf_counter() - began,
         status="time limit" if demand.seconds_left <= 0 else "iteration limit",
-        note=f"{len(table)} vectors by {program}" + (f", ended after {limit:.3g} s" if late else ""),
+        note=f"{len(table)} vectors by {program}" + (f", ended after {limit:.3g} s" if late else "")
+        + (claim(printed) if len(starts) == 1 else ""),
     )  # fmt: skip
 
 

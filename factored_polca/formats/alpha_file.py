@@ -24,7 +24,7 @@ from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats.cassandra_factoring import END, FactoredArrays, factored
 from factored_polca.formats.decimals import float_text
 from factored_polca.formats.policy_words import Word, lines_of
-from factored_polca.models.errors import ModelError
+from factored_polca.models.errors import Fault, ModelError
 
 MAXIMUM_NUMBERS: Final = 20_000_000
 """Numbers of one file."""
@@ -63,7 +63,7 @@ def read_alpha(text: str, pomdp: ArrayPOMDP) -> AlphaVectors:
     words = list(_counted(text))
     size = arrays.states + 1
     if not words:
-        raise ModelError("a file of vectors without a vector")
+        raise ModelError([Fault("a file of vectors without a vector", line=1, column=1)])
     vectors, actions = [], []
     for start in range(0, len(words), size):
         part = words[start : start + size]

@@ -1,15 +1,14 @@
 """A zip of texts, JSON and arrays: written whole or not at all, and read as a stranger's.
 
-Arrays are npy files (version 1.0, C order) of the few types in `KINDS`; there is no pickle.  Sizes are
-capped before anything is unpacked, and what an array's header says is compared with the bytes that are
-there before memory is taken for it.
+Arrays are npy files (`factored_polca.formats.npy`) of the few types in `KINDS`; there is no pickle.  Sizes
+are capped before anything is unpacked, and what an array's header says is compared with the bytes that
+are there before memory is taken for it.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import math
 import os
 import secrets
 import struct
@@ -24,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.formats.files import destination
+from factored_polca.formats.npy import read_npy
 from factored_polca.models.errors import ModelError
 
 MAXIMUM_BYTES: Final = 4 << 30
@@ -98,16 +98,10 @@ class Archive:
     def array(self, name: str, kind: str, dimensions: int = 1) -> npt.NDArray[Any]:
         """The array NAME.npy of one of the `KINDS`: int64 or float64, every number finite."""
         data = self._archive.read(f"{self._prefix}{name}.npy")
-        stream = io.BytesIO(data)
-        if np.lib.format.read_magic(stream) != (1, 0):
-            raise ValueError(f"{name} is no npy file of version 1.0")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-        if dtype.str not in KINDS[kind] or fortran or len(shape) != dimensions:
+        found = read_npy(data, name)
+        if found.dtype.str not in KINDS[kind] or found.ndim != dimensions:
             raise ValueError(f"{name} is no array of {kind} with {dimensions} dimensions")
-        if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-            raise ValueError(f"{name} has not as many bytes as its shape needs")
-        flat = np.frombuffer(data, dtype=dtype, offset=stream.tell())
-        array = flat.reshape(shape).astype(np.float64 if kind == "numbers" else np.int64)
+        array = found.astype(np.float64 if kind == "numbers" else np.int64)
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} has a number that is not finite")
         return array

@@ -45,14 +45,22 @@ Sources: A. R. Cassandra, "POMDP file format" and "POMDP file grammar", pomdp.or
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from scipy.sparse import csr_array
+
 from factored_polca.explicit.exact_pomdp import enumerate_pomdp
+from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats.cassandra_reader import read_pomdp_with_warnings
-from factored_polca.formats.cassandra_writer import write_mdp, write_pomdp
+from factored_polca.formats.cassandra_writer import write_factored, write_mdp, write_pomdp
 from factored_polca.models.errors import Fault, LimitReached, ModelError
 from factored_polca.models.model import Model
 from factored_polca.models.scalars import describe, scalar
 
-__all__ = ["read_pomdp", "read_pomdp_with_warnings", "write_mdp", "write_model", "write_pomdp"]
+__all__ = [
+    "plainly_labelled", "read_pomdp", "read_pomdp_with_warnings", "write_factored", "write_mdp",
+    "write_model", "write_pomdp",
+]  # fmt: skip
 
 MAXIMUM_LISTED = 20_000
 """States of a model that `write_model` lists."""
@@ -83,4 +91,21 @@ def write_model(model: Model) -> str:
         ", ".join(f"{f.name}={describe(scalar(v))}" for f, v in zip(model.features, values, strict=True))
         for values in exact.state_values
     ]
-    return write_pomdp(exact.to_arrays(), model.name, shown)
+    return write_pomdp(plainly_labelled(exact.to_arrays(), model), model.name, shown)
+
+
+def plainly_labelled(pomdp: ArrayPOMDP, model: Model) -> ArrayPOMDP:
+    """The arrays of `model`; what its only channel says is not called `channel=value` but `value`.
+
+    The first action has all that the channel says, in its order: so a file that was read keeps its own.
+    """
+    if len(model.observations) != 1:
+        return pomdp
+    (channel,) = model.observations
+    start = f"{channel.name}="
+    rows = [tuple(label.removeprefix(start) for label in row) for row in pomdp.observations]
+    labels = tuple(describe(scalar(value)) for value in channel.values)
+    first = dict(zip(rows[0], pomdp.kernel[0], strict=True))
+    nothing = csr_array((pomdp.states, pomdp.states))
+    kernel = (tuple(first.get(label, nothing) for label in labels), *pomdp.kernel[1:])
+    return replace(pomdp, observations=(labels, *rows[1:]), kernel=kernel)

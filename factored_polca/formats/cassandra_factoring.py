@@ -13,7 +13,8 @@ Observations are padded: one set for all actions, by their names.  Where states 
 seen of them (`observed`, y) and y is news, which the last y and the action do not foretell, it becomes part
 of the observation: o is then (o, y).  There is no observation before the first action, so the start must
 foretell its y; `with_first_step` puts a step before it that shows y.  If every state is seen the process is
-an MDP and has no observations.
+an MDP and has no observations.  A single observation is padded to two, the second of which, `never`, never
+comes: pomdp-solve does not take files with one.
 
 Terminal states are one state `end` that is never left, with reward 0 for every action and an observation
 of its own, `ended`: its value is 0, and that it was reached is seen.
@@ -38,6 +39,8 @@ END: Final = -1
 """In `FactoredArrays.origin`: the state that stands for all terminal ones."""
 ENDED: Final = "ended"
 """The observation of the end."""
+NEVER: Final = "never"
+"""The observation beside a single one."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,11 @@ class _Entries:
     chance: FloatArray
 
 
-def factored(pomdp: ArrayPOMDP) -> FactoredArrays:
+def factored(pomdp: ArrayPOMDP, *, as_mdp: bool = True, start_told: bool = True) -> FactoredArrays:
     """`pomdp` with transitions and observations apart.
+
+    Without `as_mdp` there are observations even if every state is seen.  Without `start_told` it does not
+    matter what is seen at the start.
 
     Raises:
         ModelError: an action that does not apply everywhere, or something that is seen of the state and
@@ -81,8 +87,10 @@ def factored(pomdp: ArrayPOMDP) -> FactoredArrays:
     _require_total(pomdp)
     live = np.flatnonzero(~pomdp.terminal)
     seen = pomdp.observed[live]
-    mdp = len(np.unique(seen)) == len(live) and len(live) > 1
-    entries, labels = _entries(pomdp, mdp)
+    mdp = as_mdp and len(np.unique(seen)) == len(live) and len(live) > 1
+    entries, labels = _entries(pomdp, mdp, start_told)
+    if not mdp and len(labels) == 1:
+        labels = (*labels, NEVER if labels != (NEVER,) else f"{NEVER}_2")
     split = np.zeros(pomdp.states, dtype=np.bool_)
     if not mdp:
         for part in entries:
@@ -151,12 +159,12 @@ def _require_total(pomdp: ArrayPOMDP) -> None:
                                     "say what happens elsewhere: this format needs it")])  # fmt: skip
 
 
-def _entries(pomdp: ArrayPOMDP, mdp: bool) -> tuple[list[_Entries], tuple[str, ...]]:
+def _entries(pomdp: ArrayPOMDP, mdp: bool, start_told: bool) -> tuple[list[_Entries], tuple[str, ...]]:
     """The kernels with the numbers of padded observations, and these observations' labels."""
     names = tuple(dict.fromkeys(label for row in pomdp.observations for label in row))
     number = {name: k for k, name in enumerate(names)}
     kinds = int(pomdp.observed.max()) + 1
-    news = not mdp and _is_news(pomdp)
+    news = not mdp and _is_news(pomdp, start_told)
     found = []
     for row, matrices in zip(pomdp.observations, pomdp.kernel, strict=True):
         pieces = [matrix.tocoo() for matrix in matrices]
@@ -182,14 +190,14 @@ def _entries(pomdp: ArrayPOMDP, mdp: bool) -> tuple[list[_Entries], tuple[str, .
     return renumbered, tuple(labels)
 
 
-def _is_news(pomdp: ArrayPOMDP) -> bool:
+def _is_news(pomdp: ArrayPOMDP, start_told: bool) -> bool:
     """Whether what is seen of the state says more than the action and what was seen before.
 
     Raises:
         ModelError: it does at the start, where there is no observation.
     """
     begun = (pomdp.initial > 0) & ~pomdp.terminal
-    if len(np.unique(pomdp.observed[begun])) > 1:
+    if start_told and len(np.unique(pomdp.observed[begun])) > 1:
         raise ModelError([Fault(
             "part of the state is seen, and the start leaves open what is seen first", ("initial",),
             "this format has no observation before the first action: give the observed features one "

@@ -14,7 +14,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from typing import Final, NamedTuple
 
@@ -35,7 +35,7 @@ class Steps:
     """The count of the work done so far, and how far it may go."""
 
     used: int = 0
-    deadline: int = MAXIMUM_STEPS
+    deadline: int = field(default_factory=lambda: MAXIMUM_STEPS)
 
     def count(self, steps: int) -> None:
         """Count `steps`.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Final
 
-from factored_polca.formats.cassandra_layers import ANY, Row
+from factored_polca.formats.cassandra_layers import ANY, Row, StepLimit, Steps
 from factored_polca.formats.cassandra_names import Index
 from factored_polca.formats.cassandra_numbers import Numbers
 from factored_polca.formats.cassandra_tokens import Token, Tokens
@@ -37,19 +37,20 @@ class Preamble:
     start_place: int | None
 
 
-def read_preamble(tokens: Tokens, numbers: Numbers) -> Preamble:
-    """The preamble, up to the first entry or the end.
+def read_preamble(tokens: Tokens, numbers: Numbers, steps: Steps) -> Preamble:
+    """The preamble, up to the first entry or the end; values of an index count as steps.
 
     Raises:
         ModelError: it is not right, or something is missing.
     """
-    return _Reader(tokens, numbers).preamble()
+    return _Reader(tokens, numbers, steps).preamble()
 
 
 @dataclass
 class _Reader:
     tokens: Tokens
     numbers: Numbers
+    steps: Steps
     seen: set[str] = field(default_factory=set)
     discount: Fraction | None = None
     indices: dict[str, Index] = field(default_factory=dict)
@@ -149,6 +150,10 @@ class _Reader:
     def _limit(self, count: int, most: int, section: str, token: Token) -> None:
         if count > most:
             raise self.tokens.error(f"more than {most} {section}", token.start, f"at most {most} are read")
+        try:
+            self.steps.count(count)
+        except StepLimit:
+            raise self.tokens.error(f"too much work before {section}", token.start) from None
 
     @staticmethod
     def _integer(token: Token, most: int) -> int | None:

@@ -50,8 +50,8 @@ class _Reader:
     def __init__(self, text: str) -> None:
         self.tokens = Tokens(text)
         self.numbers = Numbers(self.tokens)
-        self.preamble = read_preamble(self.tokens, self.numbers)
         self.steps = Steps()
+        self.preamble = read_preamble(self.tokens, self.numbers, self.steps)
         self.ledger = Ledger(self.tokens.fault)
         self.decisions = Decisions(self.steps)
         self.place = self.tokens.token.start  # what is being worked on, for messages

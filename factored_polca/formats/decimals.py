@@ -17,6 +17,9 @@ from factored_polca.formats.spudd_text import MAXIMUM_DIGITS, decimal_text
 DIGITS: Final = 17
 """Significant digits of a rounded number: enough for every double."""
 
+FLOAT_DIGITS: Final = 15
+"""Significant digits of a probability that was computed with floats: those that any decimal keeps."""
+
 _ROUNDED: Final = Context(prec=DIGITS)
 _EXACT: Final = Context(prec=2 * MAXIMUM_DIGITS)
 
@@ -36,8 +39,12 @@ def row_texts(chances: Sequence[Fraction]) -> list[str]:
 
 
 def float_row_texts(chances: Sequence[float]) -> list[str]:
-    """Floats that sum to about 1 as decimals that sum to exactly 1."""
-    return _closed([Decimal(repr(chance)) for chance in chances])
+    """Floats that sum to about 1 as decimals of `FLOAT_DIGITS` digits that sum to exactly 1.
+
+    Floats have been through products and sums: 0.9 * 0.05 / 0.9 is 0.05 but for the last digits, which
+    are left out.  What is written is read and written again as the same decimals.
+    """
+    return _closed([Decimal(f"{chance:.{FLOAT_DIGITS}g}") for chance in chances])
 
 
 def float_text(value: float) -> str:

@@ -7,8 +7,9 @@ all of a document refuses it and says why.
 from __future__ import annotations
 
 import os
+import re
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -111,11 +112,30 @@ def _write_prism(document: Document) -> str:
     return write_prism(document.model)
 
 
+def _read_rddl(text: str, overrides: Mapping[str, str], name: str) -> Document:
+    return _read_rddl_texts((text,), overrides, ("",))
+
+
+def _read_rddl_texts(texts: Sequence[str], overrides: Mapping[str, str], files: Sequence[str]) -> Document:
+    if overrides:
+        listed = ", ".join(overrides)
+        raise ModelError(f"RDDL has no parameters to set ({listed}): edit the non-fluents")
+    from factored_polca.formats.rddl import read_rddl_with_warnings
+
+    model, warnings, locate = read_rddl_with_warnings(texts, files)
+    return Document(model, None, warnings, locate)
+
+
+def _write_rddl(document: Document) -> str:
+    raise ModelError([Fault("RDDL is read, not written", hint="write a .toml, .spudd or .pomdpx file")])
+
+
 _NATIVE: Final = Format("native", _read_native, _write_native)
 _SPUDD: Final = Format("SPUDD", _read_spudd, _write_spudd)
 _POMDPX: Final = Format("POMDPX", _read_pomdpx, _write_pomdpx)
 _CASSANDRA: Final = Format("Cassandra", _read_cassandra, _write_cassandra)
 _PRISM: Final = Format("PRISM", _read_prism, _write_prism)
+_RDDL: Final = Format("RDDL", _read_rddl, _write_rddl)
 
 FORMATS: Final[Mapping[str, Format]] = {
     ".toml": _NATIVE,
@@ -127,6 +147,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".prism": _PRISM,
     ".nm": _PRISM,
     ".pm": _PRISM,
+    ".rddl": _RDDL,
 }
 
 
@@ -154,11 +175,37 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
     Raises:
         ModelError: no such file, no known format, or a text at fault; names file, line and column.
     """
-    chosen = format_of(path)
+    chosen, both = format_of(path), parts(path)
+    if chosen is _RDDL:
+        try:
+            texts = [_decoded(_bytes(part, named=True), strict=False) for part in both]
+            document = _read_rddl_texts(texts, overrides or {}, [str(part) for part in both])
+        except ModelError as error:
+            raise error.in_file(str(path)) from None
+        return _located(document, path)
     try:
-        document = chosen.read(_text(Path(path)), overrides or {}, Path(path).stem)
+        data = _bytes(Path(path))
     except ModelError as error:
         raise error.in_file(str(path)) from None
+    return document_of(data, path, overrides)
+
+
+def document_of(data: bytes, path: str | Path, overrides: Mapping[str, str] | None = None) -> Document:
+    """The model in `data`, the bytes of a file called `path`: its extension tells the format.
+
+    Raises:
+        ModelError: no known format, or a text at fault; names file, line and column.
+    """
+    chosen = format_of(path)
+    try:
+        document = chosen.read(_decoded(data), overrides or {}, Path(path).stem)
+    except ModelError as error:
+        raise error.in_file(str(path)) from None
+    return _located(document, path)
+
+
+def _located(document: Document, path: str | Path) -> Document:
+    """The document, its warnings and later faults told with the file's name."""
 
     def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
         return ModelError(document.locate(faults)).in_file(str(path)).faults
@@ -167,19 +214,40 @@ def read(path: str | Path, overrides: Mapping[str, str] | None = None) -> Docume
     return replace(document, warnings=warnings, locate=locate)
 
 
-def _text(path: Path) -> str:
+def parts(path: str | Path) -> tuple[Path, ...]:
+    """The files that a path names: two for `DOMAIN.rddl+INSTANCE.rddl`, unless there is such a file."""
+    text = str(path)
+    if text.lower().endswith(".rddl") and not Path(path).is_file():
+        cuts = [match.end() for match in re.finditer(r"\.rddl(?=\+.)", text, re.IGNORECASE)]
+        for cut in cuts:
+            if Path(text[:cut]).is_file() or len(cuts) == 1:
+                return Path(text[:cut]), Path(text[cut + 1 :])
+    return (Path(path),)
+
+
+def _bytes(path: Path, *, named: bool = False) -> bytes:
+    """What a file holds; `named`: its own name is told where it is missing."""
     try:
         with path.open("rb") as stream:
             data = stream.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         listed = ", ".join(FORMATS)
-        raise ModelError([Fault("there is no such file", hint=f"formats are {listed}")]) from None
+        fault = Fault(
+            "there is no such file", hint=f"formats are {listed}", file=str(path) if named else ""
+        )
+        raise ModelError([fault]) from None
     except (OSError, ValueError) as error:
         raise ModelError(f"the file can't be read: {_reason(error)}") from None
+    return data
+
+
+def _decoded(data: bytes, *, strict: bool = True) -> str:
+    """The text; without `strict`, bytes that are no UTF-8 become one sign, not a fault."""
     if len(data) > MAXIMUM_BYTES:
-        raise ModelError(f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read")
+        message = f"the file has more than {MAXIMUM_BYTES} bytes, the most that is read"
+        raise ModelError([Fault(message, line=1, column=1)])
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8", "strict" if strict else "replace")
     except UnicodeDecodeError as error:
         before = data[: error.start]
         line = before.count(b"\n") + 1

@@ -24,7 +24,7 @@ from factored_polca.explicit.policy_graph import PolicyGraph
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats.cassandra_factoring import factored, seen_label
 from factored_polca.formats.policy_words import Word, lines_of
-from factored_polca.models.errors import ModelError
+from factored_polca.models.errors import Fault, ModelError
 
 MAXIMUM_NODES: Final = 1_000_000
 """Nodes of one file."""
@@ -71,7 +71,7 @@ def read_graph(
     labels = _labels(pomdp) if labels is None else labels
     rows = list(_rows(text, len(labels)))
     if not rows:
-        raise ModelError("a policy graph without a node")
+        raise ModelError([Fault("a policy graph without a node", line=1, column=1)])
     kinds = int(pomdp.observed.max()) + 1
     actions, successors = [], []
     for node, words in enumerate(rows):

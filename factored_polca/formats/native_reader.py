@@ -17,7 +17,7 @@ from typing import Any, Final
 from factored_polca.formats.document import Document
 from factored_polca.formats.positions import Path, scan
 from factored_polca.formats.toml_text import MAXIMUM_DIGITS, Decimal, load
-from factored_polca.models.check import MAXIMUM_FEATURES, MAXIMUM_VALUES, check, check_tasks
+from factored_polca.models.check import MAXIMUM_FEATURES, MAXIMUM_VALUES, model_faults, task_faults
 from factored_polca.models.errors import Fault, ModelError
 from factored_polca.models.expressions import FALSE, Constant, Expression, depth
 from factored_polca.models.features import Feature
@@ -26,12 +26,13 @@ from factored_polca.models.model import Action, InitialBelief, Model, Observatio
 from factored_polca.models.scalars import Value
 from factored_polca.models.scope import Scope
 from factored_polca.models.tasks import Task, TaskHierarchy
+from factored_polca.models.work import Work
 
 MAXIMUM_ACTIONS: Final = 100_000
 MAXIMUM_TASKS: Final = 10_000
 MAXIMUM_VALUES_IN_ALL: Final = 1_000_000
 MAXIMUM_FAULTS: Final = 1_000
-"""More faults than this are counted, not listed."""
+"""Reading stops after as many."""
 
 _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "a model": (
@@ -63,6 +64,8 @@ def read_native(text: str, overrides: Mapping[str, str] | None = None, *, name: 
         document = reader.document(name, overrides or {})
     except RecursionError:
         raise reader.located(text, [*reader.found, reader.too_deep()]) from None
+    except _Enough:
+        raise reader.located(text, reader.found) from None
     errors = [found for found in reader.found if found.fault.severity == "error"]
     if errors:
         raise reader.located(text, errors)
@@ -70,7 +73,7 @@ def read_native(text: str, overrides: Mapping[str, str] | None = None, *, name: 
 
     def locate(faults: Iterable[Fault]) -> tuple[Fault, ...]:
         places = [_Found(fault, reader.places.get(fault.path, fault.path)) for fault in faults]
-        return reader.located(text, places).faults
+        return reader.located(text, places, absent=(0, 0)).faults
 
     return Document(document.model, document.tasks, warnings, locate)
 
@@ -84,15 +87,22 @@ def read_native_tasks(text: str, model: Model) -> TaskHierarchy:
     text = text.removeprefix("\ufeff").replace("\r\n", "\n")
     reader = _Reader(load(text))
     reader.scope = model.scope()
-    table = reader.section("tasks", MAXIMUM_TASKS)
-    if not table:
-        reader.fault("there are no tasks", ("tasks",), "add a table such as [tasks.Root]")
-    tasks = TaskHierarchy(reader.task(key, value) for key, value in table.items())
-    if table:
-        reader.checked(check_tasks(model, tasks))
+    try:
+        table = reader.section("tasks", MAXIMUM_TASKS)
+        if not table:
+            reader.fault("there are no tasks", ("tasks",), "add a table such as [tasks.Root]")
+        tasks = TaskHierarchy(reader.task(key, value) for key, value in table.items())
+        if table:
+            reader.checked(task_faults(model, tasks))
+    except _Enough:
+        pass
     if reader.found:
         raise reader.located(text, reader.found)
     return tasks
+
+
+class _Enough(Exception):
+    """`MAXIMUM_FAULTS` faults were found, or one after which reading on is of no use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +127,23 @@ class _Reader:
         self.parsed: dict[str, Expression] = {}
         self.scope = Scope()
         self.values_left = MAXIMUM_VALUES_IN_ALL
+        self.work = Work()
 
     # -- faults ----------------------------------------------------------------------------
 
+    def add(self, found: _Found) -> None:
+        if len(self.found) >= MAXIMUM_FAULTS:
+            raise _Enough
+        self.found.append(found)
+
     def fault(self, message: str, path: Path, hint: str = "", *, at_key: bool = False) -> None:
         self.failed.add(path)
-        self.found.append(_Found(Fault(message, path, hint), path, at_key=at_key))
+        self.add(_Found(Fault(message, path, hint), path, at_key=at_key))
+
+    def refuse(self, message: str, path: Path) -> _Enough:
+        """The exception for a fault after which reading on would be too much work."""
+        self.fault(message, path)
+        return _Enough()
 
     def checked(self, faults: Iterable[Fault]) -> None:
         """Takes over what `check` found, except in parts that were already at fault."""
@@ -134,14 +155,17 @@ class _Reader:
                 sections = ("features", "observations", "parameters")
                 there = [s for s in sections if len(place) > 1 and place[1] in self.data.get(s, ())]
                 place = (there[-1], *place[1:]) if there else place
-            self.found.append(_Found(fault, place))
+            self.add(_Found(fault, place))
 
     def too_deep(self) -> _Found:
         path = max(self.expressions, key=lambda p: depth(self.expressions[p]), default=())
         return _Found(Fault("nested too deeply", path, "split the expression, or use switch(...)"), path)
 
-    def located(self, text: str, found: Iterable[_Found]) -> ModelError:
-        """The error with a line and column for each fault, in the order of the text."""
+    def located(self, text: str, found: Iterable[_Found], absent: tuple[int, int] = (1, 1)) -> ModelError:
+        """The error with a line and column for each fault, in the order of the text.
+
+        What is about something that the text lacks has the place `absent`.
+        """
         positions = scan(text)
         faults = []
         for item in found:
@@ -152,11 +176,13 @@ class _Reader:
                 line, column = positions.inside(item.place, item.value, fault.line, fault.column)
             else:
                 line, column = (positions.of_key if item.at_key else positions.of_value)(item.place)
+                line, column = (line, column) if line else absent
             faults.append(replace(fault, line=line, column=column))
         faults.sort(key=lambda fault: (fault.line == 0, fault.line, fault.column))
-        if len(faults) > MAXIMUM_FAULTS:
-            rest = Fault(f"and {len(faults) - MAXIMUM_FAULTS} more faults")
-            faults = [*faults[:MAXIMUM_FAULTS], rest]
+        if len(faults) >= MAXIMUM_FAULTS:
+            last = faults[-1]
+            message = f"reading stopped: there are {MAXIMUM_FAULTS} faults"
+            faults.append(Fault(message, line=last.line, column=last.column))
         return ModelError(faults)
 
     # -- shapes ----------------------------------------------------------------------------
@@ -177,7 +203,7 @@ class _Reader:
     def section(self, name: str, limit: int = MAXIMUM_VALUES_IN_ALL) -> dict[str, Any]:
         table = self.table((name,), self.data.get(name, {}))
         if len(table) > limit:
-            raise ModelError(f"{len(table)} {name}; at most {limit} are read")
+            raise self.refuse(f"{len(table)} {name}; at most {limit} are read", (name,))
         return table
 
     def text(self, path: Path, value: Any, hint: str = "") -> str:
@@ -224,7 +250,7 @@ class _Reader:
             self.fault(f"{_shown(value)} gives no values", path, _VALUES_HINT)
         self.values_left -= len(result)
         if self.values_left < 0:
-            raise ModelError(f"more than {MAXIMUM_VALUES_IN_ALL} values of features in all")
+            raise self.refuse(f"more than {MAXIMUM_VALUES_IN_ALL} values of features in all", path)
         return result
 
     # -- expressions -----------------------------------------------------------------------
@@ -236,11 +262,14 @@ class _Reader:
         if shown and shown != path:
             self.places.setdefault(shown, path)
         try:
-            result = self.read(value) if scope is None else _expression(value, scope)
+            result = self.read(value) if scope is None else _expression(value, scope, self.work)
         except ModelError as error:
             self.failed.add(path)
             text = value if isinstance(value, str) else None
-            self.found += [_Found(replace(fault, path=shown or path), path, text) for fault in error.faults]
+            for fault in error.faults:
+                self.add(_Found(replace(fault, path=shown or path), path, text))
+            if self.work.exceeded:
+                raise _Enough from None
             return FALSE
         except RecursionError:
             self.fault("nested too deeply", path, "split the expression, or use switch(...)")
@@ -254,9 +283,9 @@ class _Reader:
     def read(self, value: Any) -> Expression:
         """The expression in the model's scope; actions often repeat a text, which is read once."""
         if not isinstance(value, str):
-            return _expression(value, self.scope)
+            return _expression(value, self.scope, self.work)
         if value not in self.parsed:
-            self.parsed[value] = _expression(value, self.scope)
+            self.parsed[value] = _expression(value, self.scope, self.work)
         return self.parsed[value]
 
     def table_of_expressions(self, path: Path, value: Any) -> list[tuple[str, Expression]]:
@@ -306,12 +335,12 @@ class _Reader:
             horizon=self.horizon(data.get("horizon")),
             description=self.text(("description",), data.get("description", "")),
         )
-        self.checked(check(model))
+        self.checked(model_faults(model))
         tasks = None
         if "tasks" in data:
             table = self.section("tasks", MAXIMUM_TASKS)
             tasks = TaskHierarchy(self.task(key, value) for key, value in table.items())
-            self.checked(check_tasks(model, tasks))
+            self.checked(task_faults(model, tasks))
         return Document(model, tasks)
 
     def parameters(self, overrides: Mapping[str, str]) -> list[tuple[str, Fraction]]:
@@ -321,14 +350,14 @@ class _Reader:
             path = ("parameters", key)
             if key not in table:
                 hint = f"its parameters are {', '.join(table) or 'none'}"
-                self.found.append(_Found(Fault(f"the model has no parameter {key!r}", path, hint), None))
+                self.add(_Found(Fault(f"the model has no parameter {key!r}", path, hint), None))
                 continue
             apart = _Reader({})
             result[key] = apart.constant(path, str(text))
             for found in apart.found:
                 message = f"the value {_shown(text)} for a parameter: {found.fault.message}"
                 fault = Fault(message, path, found.fault.hint or _NUMBER_HINT)
-                self.found.append(_Found(fault, None))
+                self.add(_Found(fault, None))
         return list(result.items())
 
     def feature(self, path: Path, name: str, value: Any) -> Feature:
@@ -425,10 +454,11 @@ class _Reader:
         return common, single
 
 
-def _expression(value: Any, scope: Scope) -> Expression:
+def _expression(value: Any, scope: Scope, work: Work) -> Expression:
     """The expression of a TOML value: a text in the expression language, a number or a truth value."""
     if isinstance(value, str):
-        return parse(value, scope)
+        return parse(value, scope, work)
+    work.count(1)
     if isinstance(value, bool):
         return Constant(value)
     if isinstance(value, int):

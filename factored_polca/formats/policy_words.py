@@ -65,7 +65,7 @@ def lines_of(text: str) -> Iterator[list[Word]]:
         ModelError: a text of more than `MAXIMUM_LENGTH` characters.
     """
     if len(text) > MAXIMUM_LENGTH:
-        raise ModelError(f"a file of more than {MAXIMUM_LENGTH} characters")
+        raise ModelError([Fault(f"a file of more than {MAXIMUM_LENGTH} characters", line=1, column=1)])
     for number, line in enumerate(text.split("\n"), 1):
         words = [Word(m.group(), number, m.start() + 1) for m in _WORD.finditer(line)]
         if words:

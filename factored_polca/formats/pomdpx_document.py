@@ -203,7 +203,7 @@ def parse(text: str) -> Element:
             more than the limits of this module allow.
     """
     if len(text) > MAXIMUM_LENGTH:
-        raise ModelError(f"a file of more than {MAXIMUM_LENGTH} characters")
+        raise error(f"a file of more than {MAXIMUM_LENGTH} characters", Place(1, 1))
     try:
         data = text.encode("utf-8")
     except UnicodeEncodeError as problem:

@@ -266,19 +266,20 @@ def _plain(word: str) -> bool:
 
 
 def _forbidden(name: str) -> list[str]:
-    return [c for c in name if c.isspace() or ord(c) < 32 or c in '`"']
+    return [c for c in name if c.isspace() or not c.isprintable() or c in '`"']
 
 
 def check_name(name: str, place: Place) -> None:
     """Refuse what can't be a name.
 
     Raises:
-        ModelError: empty, too long, or with a space, a quote or a control character.
+        ModelError: empty, too long, or with a space, a quote or a character that can't be shown.
     """
     if not name:
         raise error("an empty name", place)
     if len(name) > MAXIMUM_NAME:
         raise error(f"a name of more than {MAXIMUM_NAME} characters", place)
     if _forbidden(name):
-        raise error(f"the name {quoted(name)} has a space, a quote or a control character", place,
+        what = "a space, a quote or a character that can't be shown"
+        raise error(f"the name {quoted(name)} has {what}", place,
                     "use letters, digits, '_' and '-'")  # fmt: skip

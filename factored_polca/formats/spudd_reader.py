@@ -263,7 +263,7 @@ class _Reader:
 
     def _cost(self, action: str) -> tuple[Expression, ...]:
         tree = self.trees.tree(Place(f"the cost of {action}", None, True, True))
-        return _terms(self.forest.negate(tree))
+        return tuple(self.forest.negate(term) for term in _terms(tree))
 
     def _transition(self, action: str, effects: dict[str, Expression], starts: dict[str, int]) -> None:
         token = self.tokens.name(f"a variable, 'observe', 'cost' or 'endaction' in action {action!r}")

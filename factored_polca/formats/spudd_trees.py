@@ -77,6 +77,11 @@ class Forest:
         self._steps = 0
         self._deadline = MAXIMUM_STEPS
 
+    @property
+    def used(self) -> int:
+        """The steps counted so far."""
+        return self._steps
+
     # -- construction ------------------------------------------------------------------------
 
     def _intern(

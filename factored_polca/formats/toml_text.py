@@ -47,7 +47,7 @@ def load(text: str) -> dict[str, Any]:
         raise _syntax_error(text, str(error)) from None
     except (ValueError, RecursionError) as error:
         # tomllib lets Python's own limits through, for example on the digits of an integer
-        raise ModelError(f"the text is beyond what can be read: {error}") from None
+        raise _fault(text, 0, f"the text is beyond what can be read: {error}") from None
 
 
 def _fault(text: str, offset: int, message: str, hint: str = "") -> ModelError:
@@ -73,7 +73,7 @@ _PIECE: Final = re.compile(
 def _bounded(text: str) -> None:
     """Refuses a text that would take the parser's time, memory or stack."""
     if len(text) > MAXIMUM_CHARACTERS:
-        raise ModelError(f"a text of {len(text)} characters; at most {MAXIMUM_CHARACTERS} are read")
+        raise _fault(text, 0, f"a text of {len(text)} characters; at most {MAXIMUM_CHARACTERS} are read")
     try:
         text.encode("utf-8")
     except UnicodeEncodeError as error:

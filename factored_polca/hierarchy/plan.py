@@ -159,9 +159,8 @@ def plan_mdp(
             ]
         )
     if model.horizon is not None:
-        raise ModelError(
-            [Fault("a finite horizon can't be planned for", ("horizon",), "remove it, or give a discount")]
-        )
+        hint = "remove it and give a discount (plan --discount D), or use solve"
+        raise ModelError([Fault("a finite horizon can't be planned for", ("horizon",), hint)])
     hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
     symbolic = symbolic or compile_model(
         model,

@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams import INDEX, Diagram, dump, leaves, load
 from factored_polca.formats import destination, read_native, write_native
+from factored_polca.formats.npy import read_npy
 from factored_polca.hierarchy.check import checked
 from factored_polca.hierarchy.executable import ExecutablePlan, TaskPolicy, composed_policy
 from factored_polca.minimisation import Partition
@@ -184,6 +185,4 @@ def _read_array(archive: zipfile.ZipFile, name: str, kind: Any, length: int) -> 
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
-    buffer = io.BytesIO(archive.read(f"{name}.npy"))
-    array: npt.NDArray[Any] = np.lib.format.read_array(buffer, allow_pickle=False)
-    return array
+    return read_npy(archive.read(f"{name}.npy"), name)

@@ -151,7 +151,9 @@ def refuse_unplannable(model: Model) -> None:
         faults.append(Fault("the model is fully observed", ("observability",), "plan it with PolCA"))
     if model.horizon is not None:
         message = "a finite horizon can't be planned for with tasks"
-        faults.append(Fault(message, ("horizon",), "remove it and give a discount, or use solve"))
+        faults.append(
+            Fault(message, ("horizon",), "remove it and give a discount (plan --discount D), or use solve")
+        )
     elif not model.discount < 1:
         message = "at discount 1 a partially observed model has no defined value without a horizon"
         faults.append(Fault(message, ("discount",), "give a discount below 1"))

@@ -33,7 +33,6 @@ from factored_polca.minimisation.observations import count_before
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import FloatArray, Int32Array, Int64Array
 from factored_polca.minimisation.quotient import (
-    as_float,
     block_texts,
     distinct_rewards,
     exact_rewards,
@@ -45,6 +44,7 @@ from factored_polca.models import Fault, ModelError, Value
 from factored_polca.models.features import position
 from factored_polca.models.scalars import describe, scalar
 from factored_polca.symbolic import SymbolicModel
+from factored_polca.symbolic.floats import as_float
 
 MAXIMUM_OBSERVATIONS: Final = 1_000
 """Largest number of joint observations of one choice, proportional columns not merged yet."""
@@ -161,6 +161,30 @@ class PomdpQuotient(DrawnGraph, Framed):
         from factored_polca.formats.files import write_text
 
         write_text(path, lambda: self.to_pomdp_text(first_step=first_step))
+
+    def to_pomdpx(self, path: str | Path, *, first_step: bool = False) -> None:
+        """Write the quotient as a POMDPX file with one variable, the block; it appears whole or not at all.
+
+        `first_step` is that of `to_pomdp`.
+
+        Raises:
+            ModelError: the format can't express it, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, lambda: self.to_pomdpx_text(first_step=first_step))
+
+    def to_pomdpx_text(self, *, first_step: bool = False) -> str:
+        """The text that `to_pomdpx` writes.
+
+        Raises:
+            ModelError: the format can't express it.
+        """
+        from factored_polca.formats.cassandra import read_pomdp
+        from factored_polca.formats.pomdpx import write_pomdpx
+
+        text = self.to_pomdp_text(first_step=first_step)
+        return write_pomdpx(read_pomdp(text, self.process.symbolic.model.name))
 
     def to_pomdp_text(self, *, first_step: bool = False) -> str:
         """The text that `to_pomdp` writes.

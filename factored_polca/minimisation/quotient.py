@@ -36,11 +36,9 @@ from factored_polca.minimisation.push import (
     row_table,
     rows_at,
 )
-from factored_polca.models import Fault, LimitReached, ModelError
+from factored_polca.models import LimitReached
 from factored_polca.symbolic import RowDiagram, SymbolicModel
-
-LARGEST_REWARD_EXPONENT = 200
-LARGEST_REWARD = 10**LARGEST_REWARD_EXPONENT
+from factored_polca.symbolic.floats import as_float
 
 
 @dataclass(frozen=True)
@@ -101,6 +99,27 @@ class Quotient(DrawnGraph, Framed):
 
         write_text(path, self.to_pomdp_text)
 
+    def to_pomdpx(self, path: str | Path) -> None:
+        """Write the quotient as a POMDPX file with one variable, the block; it appears whole or not at all.
+
+        Raises:
+            ModelError: a choice does not apply everywhere, or the file can't be written.
+        """
+        from factored_polca.formats.files import write_text
+
+        write_text(path, self.to_pomdpx_text)
+
+    def to_pomdpx_text(self) -> str:
+        """The text that `to_pomdpx` writes.
+
+        Raises:
+            ModelError: a choice does not apply everywhere.
+        """
+        from factored_polca.formats.cassandra import read_pomdp
+        from factored_polca.formats.pomdpx import write_pomdpx
+
+        return write_pomdpx(read_pomdp(self.to_pomdp_text(), self.process.symbolic.model.name))
+
     def to_pomdp_text(self) -> str:
         """The text that `to_pomdp` writes.
 
@@ -149,18 +168,6 @@ def exact_rewards(
     """The exact reward of a primitive at each of several states [state, feature]."""
     sums, place = distinct_rewards(process, primitive, states)
     return [sums[index] for index in place.tolist()]
-
-
-def as_float(reward: Fraction, action: str) -> float:
-    """A reward as a float.
-
-    Raises:
-        ModelError: so large that sums of it would leave the range of floats.
-    """
-    if abs(reward) > LARGEST_REWARD:
-        message = f"action {action!r} has a reward beyond 10^{LARGEST_REWARD_EXPONENT}"
-        raise ModelError([Fault(message, ("reward",), "values are floats: scale the rewards down")])
-    return float(reward)
 
 
 def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:

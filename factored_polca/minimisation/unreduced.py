@@ -43,6 +43,7 @@ from factored_polca.minimisation.outcomes import (
 from factored_polca.models import Fault, LimitReached, ModelError
 from factored_polca.models.features import position
 from factored_polca.symbolic import SymbolicAction, SymbolicModel
+from factored_polca.symbolic.floats import as_float
 
 MAXIMUM_STATES: Final = 1_000_000
 """Largest number of states that is listed unless a caller says otherwise."""
@@ -364,7 +365,7 @@ def _rewards(listing: _Listing, action: SymbolicAction, states: Int32Array, wher
     """The expected reward of each state [s], 0 outside `where`."""
     total = np.zeros(len(states))
     for term in action.rewards:
-        values = np.array([float(value) for value in term.values])
+        values = np.array([as_float(value, action.name) for value in term.values])
         total += values[evaluate_states(term.diagram, states, listing.columns).astype(np.int64)]
     total[~where] = 0
     return total

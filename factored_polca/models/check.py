@@ -8,7 +8,8 @@ of a format can add file, line and column.  What needs the values of expressions
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 import networkx as nx
 
@@ -18,13 +19,13 @@ from factored_polca.models.expressions import (
     Lottery,
     Reference,
     Switch,
-    depth,
+    children,
     references,
-    subexpressions,
 )
 from factored_polca.models.features import Feature, position
 from factored_polca.models.model import Action, Model, Observation
 from factored_polca.models.scalars import scalar
+from factored_polca.models.scope import Scope
 from factored_polca.models.tasks import Task, TaskHierarchy
 
 MAXIMUM_FEATURES = 10_000
@@ -34,33 +35,101 @@ MAXIMUM_EXPRESSION_DEPTH = 300
 Path = tuple[str, ...]
 
 
+@dataclass
+class _Context:
+    """What the expressions of a model are checked against, and what is known of them so far.
+
+    Tables `depths`, `primed` and `sound` are by the identity of parts, which the model keeps alive:
+    parts that expressions share are looked at once.
+    """
+
+    model: Model
+    scope: Scope = field(init=False)
+    features: Mapping[str, Feature] = field(init=False)
+    depths: dict[int, int] = field(default_factory=dict)
+    primed: dict[int, frozenset[str]] = field(
+        default_factory=dict
+    )  # features whose next value is mentioned
+    sound: dict[tuple[bool, bool, bool], set[int]] = field(default_factory=dict)
+    effects: set[Expression] = field(default_factory=set)  # without faults
+
+    def __post_init__(self) -> None:
+        self.scope = self.model.scope()
+        self.features = {feature.name: feature for feature in self.model.features}
+
+    def look(self, expression: Expression) -> None:
+        """Fill `depths` and `primed` for an expression and its parts, without recursion."""
+        stack = [(expression, False)]
+        while stack:
+            part, ready = stack.pop()
+            if id(part) in self.depths:
+                continue
+            parts = children(part)
+            if not ready:
+                stack.append((part, True))
+                stack.extend((child, False) for child in parts)
+                continue
+            self.depths[id(part)] = 1 + max((self.depths[id(child)] for child in parts), default=0)
+            known = {id(names): names for child in parts if (names := self.primed[id(child)])}
+            if isinstance(part, Reference) and part.primed:
+                self.primed[id(part)] = frozenset([part.name])
+            elif len(known) == 1:
+                (self.primed[id(part)],) = known.values()
+            else:
+                self.primed[id(part)] = frozenset().union(*known.values())
+
+    def unknown_parts(self, expression: Expression, sound: set[int]) -> Iterator[Expression]:
+        """The parts of an expression that are not in `sound`, each once, parts after the whole."""
+        seen: set[int] = set()
+        stack = [expression]
+        while stack:
+            part = stack.pop()
+            if id(part) in seen or id(part) in sound:
+                continue
+            seen.add(id(part))
+            yield part
+            stack.extend(reversed(children(part)))
+
+
 def check(model: Model) -> list[Fault]:
     """All structural faults of `model`, in the order of the model's parts."""
-    return list(_faults(model))
+    return list(model_faults(model))
 
 
-def _faults(model: Model) -> Iterator[Fault]:
+def model_faults(model: Model) -> Iterator[Fault]:
+    """The structural faults of `model`, one after the other."""
+    context = _Context(model)
+    if not model.name.isprintable():
+        yield Fault(f"the model's name {model.name!r} has a character that can't be shown", ("name",))
     yield from _check_features(model)
     yield from _check_numbers(model)
     if not model.actions:
         yield Fault("the model has no action", ("actions",))
     names = [action.name for action in model.actions]
     yield from _duplicates("action", names, ("actions",))
-    sound: set[Expression] = set()
     for action in model.actions:
-        yield from _check_action(model, action, sound)
+        yield from _check_action(context, action)
     for index, term in enumerate(model.rewards):
-        yield from _check_expression(model, term, ("reward", str(index)), primed=True, observed=True)
-    yield from _check_expression(model, model.terminal, ("terminal",))
-    yield from _check_initial(model)
+        yield from _check_expression(context, term, ("reward", str(index)), primed=True, observed=True)
+    yield from _check_expression(context, model.terminal, ("terminal",))
+    yield from _check_initial(context)
 
 
 def _duplicates(what: str, names: Iterable[str], path: Path) -> Iterator[Fault]:
     for name, count in Counter(names).items():
         if count > 1:
             yield Fault(f"{what} {name!r} is defined {count} times", (*path, name))
-        if not name or any(ord(c) < 32 or c in '`"' for c in name):
-            yield Fault(f"{what} name {name!r} is empty or has a quote or control character", (*path, name))
+        if not is_name(name):
+            message = f"{what} name {name!r} is empty, or has a quote or a character that can't be shown"
+            yield Fault(message, (*path, name))
+
+
+def is_name(text: str) -> bool:
+    """Whether `text` can name something: not empty, no quote in it, all of it seen when it is shown.
+
+    So no name clears a screen, hides characters or turns the direction of writing round.
+    """
+    return bool(text) and text.isprintable() and not any(c in '`"' for c in text)
 
 
 def _check_features(model: Model) -> Iterator[Fault]:
@@ -84,8 +153,11 @@ def _check_features(model: Model) -> Iterator[Fault]:
         for (_, value), count in keys.items():
             if count > 1:
                 yield Fault(f"{variable.name!r} lists the value {value!r} {count} times", path)
-            if isinstance(value, str) and (not value or any(ord(c) < 32 or c in '`"' for c in value)):
-                yield Fault(f"{variable.name!r} has the value {value!r}: empty, or with a quote", path)
+            if isinstance(value, str) and not is_name(value):
+                message = (
+                    f"{variable.name!r} has the value {value!r}: empty, or with a quote or a character"
+                )
+                yield Fault(f"{message} that can't be shown", path)
 
 
 def _check_numbers(model: Model) -> Iterator[Fault]:
@@ -112,44 +184,47 @@ def _check_numbers(model: Model) -> Iterator[Fault]:
             )
 
 
-def _check_action(model: Model, action: Action, sound: set[Expression]) -> Iterator[Fault]:
-    """The faults of an action; `sound` holds effects without any, which other actions may have too."""
+def _check_action(context: _Context, action: Action) -> Iterator[Fault]:
     path: Path = ("actions", action.name)
-    features = {feature.name: feature for feature in model.features}
+    model, features = context.model, context.features
     channels = {observation.name: observation for observation in model.observations}
     for name, count in Counter(name for name, _ in action.effects).items():
         if name not in features:
             yield Fault(
                 f"an effect on {name!r}, which is no feature", (*path, "effects", name),
-                f"features are {', '.join(features) or 'none'}",
+                f"features are {_names(features)}",
             )  # fmt: skip
         if count > 1:
             yield Fault(f"{count} effects on {name!r}", (*path, "effects", name))
     for name, effect in action.effects:
-        if effect in sound:
+        if effect in context.effects:  # other actions have it, too
             continue
-        found = list(
-            _check_expression(model, effect, (*path, "effects", name), primed=True, distribution=True)
+        faults = list(
+            _check_expression(context, effect, (*path, "effects", name), primed=True, distribution=True)
         )
-        yield from found
-        if not found:
-            sound.add(effect)
-    yield from _check_cycle(action, path)
-    yield from _check_expression(model, action.applicable, (*path, "applicable"))
+        yield from faults
+        if not faults:
+            context.effects.add(effect)
+    yield from _check_cycle(context, action, path)
+    yield from _check_expression(context, action.applicable, (*path, "applicable"))
     if model.observability == "partial" and action.applicable != _TRUE:
         yield Fault(
             f"action {action.name!r} is not applicable everywhere", (*path, "applicable"),
             "under partial observability actions are total: state what happens where it has no effect",
         )  # fmt: skip
     for index, term in enumerate(action.rewards):
-        yield from _check_expression(model, term, (*path, "reward", str(index)), primed=True, observed=True)
+        yield from _check_expression(
+            context, term, (*path, "reward", str(index)), primed=True, observed=True
+        )
     for name, sensed in action.senses:
         if name not in channels:
             yield Fault(
                 f"senses {name!r}, which is no observation", (*path, "senses", name),
-                f"observations are {', '.join(channels) or 'none'}",
+                f"observations are {_names(channels)}",
             )  # fmt: skip
-        yield from _check_expression(model, sensed, (*path, "senses", name), primed=True, distribution=True)
+        yield from _check_expression(
+            context, sensed, (*path, "senses", name), primed=True, distribution=True
+        )
     sensed_names = {name for name, _ in action.senses}
     for channel in model.observations:
         if channel.name not in sensed_names and position(channel.values, channel.null) is None:
@@ -160,12 +235,13 @@ def _check_action(model: Model, action: Action, sound: set[Expression]) -> Itera
             )
 
 
-def _check_cycle(action: Action, path: Path) -> Iterator[Fault]:
+def _check_cycle(context: _Context, action: Action, path: Path) -> Iterator[Fault]:
     graph = nx.DiGraph()
     for name, effect in action.effects:
-        for reference in references(effect):
-            if reference.primed:
-                graph.add_edge(reference.name, name)
+        context.look(effect)
+        graph.add_edges_from((parent, name) for parent in sorted(context.primed[id(effect)]))
+    if not graph:
+        return
     try:
         cycle = nx.find_cycle(graph)
     except nx.NetworkXNoCycle:
@@ -178,15 +254,15 @@ def _check_cycle(action: Action, path: Path) -> Iterator[Fault]:
     )
 
 
-def _check_initial(model: Model) -> Iterator[Fault]:
-    features = {feature.name: feature for feature in model.features}
+def _check_initial(context: _Context) -> Iterator[Fault]:
+    model, features = context.model, context.features
     graph = nx.DiGraph()
     for name, expression in model.initial.distributions:
         path = ("initial", name)
         if name not in features:
-            listed = ", ".join(features)
-            yield Fault(f"initial belief of {name!r}, which is no feature", path, f"features are {listed}")
-        yield from _check_expression(model, expression, path, distribution=True)
+            hint = f"features are {_names(features)}"
+            yield Fault(f"initial belief of {name!r}, which is no feature", path, hint)
+        yield from _check_expression(context, expression, path, distribution=True)
         graph.add_edges_from((reference.name, name) for reference in references(expression))
     yield from _duplicates(
         "initial distribution of", (n for n, _ in model.initial.distributions), ("initial",)
@@ -194,11 +270,11 @@ def _check_initial(model: Model) -> Iterator[Fault]:
     if not nx.is_directed_acyclic_graph(graph):
         yield Fault("the initial distributions depend on each other in a circle", ("initial",))
     for index, factor in enumerate(model.initial.factors):
-        yield from _check_expression(model, factor, ("initial", "factors", str(index)))
+        yield from _check_expression(context, factor, ("initial", "factors", str(index)))
 
 
 def _check_expression(
-    model: Model,
+    context: _Context,
     expression: Expression,
     path: Path,
     *,
@@ -206,12 +282,30 @@ def _check_expression(
     observed: bool = False,
     distribution: bool = False,
 ) -> Iterator[Fault]:
-    if depth(expression) > MAXIMUM_EXPRESSION_DEPTH:
+    context.look(expression)
+    if context.depths[id(expression)] > MAXIMUM_EXPRESSION_DEPTH:
         yield Fault(f"nested deeper than {MAXIMUM_EXPRESSION_DEPTH} levels", path)
         return
-    scope = model.scope()
-    features = {feature.name: feature for feature in model.features}
-    for part in subexpressions(expression):
+    sound = context.sound.setdefault((primed, observed, distribution), set())
+    parts = list(context.unknown_parts(expression, sound))
+    faulty = False
+    for fault in _part_faults(context, parts, path, primed, observed, distribution):
+        faulty = True
+        yield fault
+    if not faulty:  # else a part is told of at each place
+        sound.update(map(id, parts))
+
+
+def _part_faults(
+    context: _Context,
+    parts: Iterable[Expression],
+    path: Path,
+    primed: bool,
+    observed: bool,
+    distribution: bool,
+) -> Iterator[Fault]:
+    scope, features = context.scope, context.features
+    for part in parts:
         if isinstance(part, Reference):
             meaning = scope.resolve(part)
             if isinstance(meaning, str):
@@ -239,6 +333,12 @@ def _check_expression(
             yield Fault("a distribution can't be used here: a number or condition is expected", path)
 
 
+def _names(names: Iterable[str]) -> str:
+    """Some of `names`."""
+    found = list(names)
+    return ", ".join(found[:12]) + (", ..." if len(found) > 12 else "") or "none"
+
+
 def _listed(values: Iterable[object]) -> str:
     shown = [str(scalar(v)) if not isinstance(v, bool) else str(v).lower() for v in values]  # type: ignore[arg-type]
     return ", ".join(shown[:12]) + (", ..." if len(shown) > 12 else "")
@@ -246,10 +346,12 @@ def _listed(values: Iterable[object]) -> str:
 
 def check_tasks(model: Model, hierarchy: TaskHierarchy) -> list[Fault]:
     """All structural faults of `hierarchy` over `model`."""
-    return list(_task_faults(model, hierarchy))
+    return list(task_faults(model, hierarchy))
 
 
-def _task_faults(model: Model, hierarchy: TaskHierarchy) -> Iterator[Fault]:
+def task_faults(model: Model, hierarchy: TaskHierarchy) -> Iterator[Fault]:
+    """The structural faults of `hierarchy` over `model`, one after the other."""
+    context = _Context(model)
     actions = {action.name for action in model.actions}
     tasks = {task.name: task for task in hierarchy.tasks}
     if not tasks:
@@ -259,7 +361,7 @@ def _task_faults(model: Model, hierarchy: TaskHierarchy) -> Iterator[Fault]:
     for name in actions & set(tasks):
         yield Fault(f"{name!r} is the name of a task and of an action", ("tasks", name))
     for task in hierarchy.tasks:
-        yield from _check_task(model, task, actions, tasks)
+        yield from _check_task(context, task, actions, tasks)
     graph = nx.DiGraph()
     graph.add_nodes_from(tasks)
     graph.add_edges_from((t.name, a) for t in hierarchy.tasks for a in t.actions if a in tasks)
@@ -277,30 +379,32 @@ def _task_faults(model: Model, hierarchy: TaskHierarchy) -> Iterator[Fault]:
         )  # fmt: skip
 
 
-def _check_task(model: Model, task: Task, actions: set[str], tasks: dict[str, Task]) -> Iterator[Fault]:
+def _check_task(
+    context: _Context, task: Task, actions: set[str], tasks: dict[str, Task]
+) -> Iterator[Fault]:
     path: Path = ("tasks", task.name)
     if not task.actions:
         yield Fault("the task has no action", (*path, "actions"))
     for name, count in Counter(task.actions).items():
         if name not in actions and name not in tasks:
-            listed = ", ".join([*sorted(actions)[:12], *tasks])
+            listed = f"{_names(sorted(actions))}, {_names(tasks)}"
             yield Fault(
                 f"{name!r} is neither an action nor a task", (*path, "actions"), f"known are {listed}"
             )
         if count > 1:
             yield Fault(f"lists {name!r} {count} times", (*path, "actions"))
-    yield from _check_expression(model, task.terminal, (*path, "terminal"))
+    yield from _check_expression(context, task.terminal, (*path, "terminal"))
     for index, term in enumerate(task.pseudo_rewards):
-        yield from _check_expression(model, term, (*path, "pseudo_reward", str(index)), primed=True)
+        yield from _check_expression(context, term, (*path, "pseudo_reward", str(index)), primed=True)
     for name, terms in task.pseudo_rewards_of:
         if name not in actions:
             yield Fault(f"a pseudo-reward for {name!r}, which is no action", (*path, "pseudo_reward", name))
         for term in terms:
-            yield from _check_expression(model, term, (*path, "pseudo_reward", name), primed=True)
-    channels = {observation.name for observation in model.observations}
+            yield from _check_expression(context, term, (*path, "pseudo_reward", name), primed=True)
+    channels = {observation.name for observation in context.model.observations}
     for name in task.observes or ():
         if name not in channels:
-            listed = ", ".join(sorted(channels)) or "none"
+            listed = _names(sorted(channels))
             yield Fault(f"observes {name!r}, which is no observation: {listed}", (*path, "observes"))
 
 

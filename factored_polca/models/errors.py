@@ -30,9 +30,18 @@ class Fault:
         place = self.file
         if self.line:
             place += f":{self.line}:{self.column}" if place else f"line {self.line}, column {self.column}"
-        where = " -> ".join(self.path)
-        text = ": ".join(part for part in (place, where, self.message) if part)
-        return f"{text} ({self.hint})" if self.hint else text
+        where = " -> ".join(shown(part, 100) for part in self.path)
+        text = ": ".join(part for part in (shown(place), where, shown(self.message)) if part)
+        return f"{text} ({shown(self.hint)})" if self.hint else text
+
+
+def shown(text: str, most: int = 1000) -> str:
+    """`text` on one line of a terminal: shortened, characters that can't be shown escaped (as in \\x1b)."""
+    if len(text) > most:
+        text = f"{text[: most - 20]}..."
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 class ModelError(ValueError):

@@ -46,6 +46,7 @@ from factored_polca.models.expressions import (
 )
 from factored_polca.models.scalars import MAXIMUM_BITS, OPERATORS, Value
 from factored_polca.models.scope import Scope
+from factored_polca.models.work import MAXIMUM_STEPS, Work, steps_of
 
 MAXIMUM_LENGTH: Final = 1_000_000
 """Characters in one expression."""
@@ -114,14 +115,28 @@ def number(text: str) -> Fraction:
 
 
 class _Parser:
-    def __init__(self, text: str, scope: Scope | None) -> None:
+    def __init__(self, text: str, scope: Scope | None, work: Work) -> None:
         self.text = text
         self.scope = scope
+        self.work = work
         self.depth = 0
         if len(text) > MAXIMUM_LENGTH:
             raise self.error(f"an expression of more than {MAXIMUM_LENGTH} characters", 0)
-        self.tokens = self._tokens()
         self.position = 0
+        self.tokens: list[_Token] = []
+        self.tokens = self._tokens()
+        self.spend(len(self.tokens), 0)
+
+    def spend(self, steps: int, start: int) -> None:
+        """Count work; the limit is on all expressions of a file."""
+        if not self.work.count(steps):
+            raise self.error(f"the expressions need more than {MAXIMUM_STEPS} steps", start)
+
+    def folded(self, result: Expression) -> Expression:
+        """`result`, its arithmetic counted."""
+        if isinstance(result, Constant) and isinstance(result.value, Fraction):
+            self.spend(steps_of(result.value), self.token.start)
+        return result
 
     def error(self, message: str, start: int, hint: str = "") -> ModelError:
         line = self.text.count("\n", 0, start) + 1
@@ -240,6 +255,8 @@ class _Parser:
             self.position += 1
             right = self.term()
             parts.append(operation("negate", right) if minus else right)
+            if len(parts) == 2 and all(isinstance(part, Constant) for part in parts):
+                parts = [self.folded(operation("add", *parts))]
         return operation("add", *parts) if len(parts) > 1 else parts[0]
 
     def term(self) -> Expression:
@@ -249,9 +266,11 @@ class _Parser:
             self.position += 1
             if name == "multiply":
                 run.append(self.factor())
+                if len(run) == 2 and all(isinstance(part, Constant) for part in run):
+                    run = [self.folded(operation("multiply", *run))]
                 continue
             left = operation("multiply", *run) if len(run) > 1 else run[0]
-            run = [operation(name, left, self.factor())]
+            run = [self.folded(operation(name, left, self.factor()))]
         return operation("multiply", *run) if len(run) > 1 else run[0]
 
     def factor(self) -> Expression:
@@ -263,7 +282,7 @@ class _Parser:
         base = self.atom()
         if self.accept("**"):
             self.down()
-            base = operation("power", base, self.factor())
+            base = self.folded(operation("power", base, self.factor()))
             self.depth -= 1
         return base
 
@@ -354,6 +373,7 @@ class _Parser:
         if not isinstance(reference, Reference):
             raise self.error("switch needs the name of a feature first", start)
         cases: list[tuple[Value, Expression]] = []
+        known: set[tuple[type, Value]] = set()
         otherwise: Expression | None = None
         while self.accept(","):
             start = self.token.start
@@ -364,8 +384,9 @@ class _Parser:
                 otherwise = self.expression()
                 continue
             value = self.case_value()
-            if any(type(value) is type(v) and value == v for v, _ in cases):
+            if (type(value), value) in known:
                 raise self.error(f"the value {value!r} has two cases", start)
+            known.add((type(value), value))
             self.expect(":", "between a value and its case")
             cases.append((value, self.expression()))
         self.expect(")", "to close switch(")
@@ -387,14 +408,17 @@ class _Parser:
         raise self.error("a case needs a value: an integer, true, false or a name", token.start)
 
 
-def parse(text: str, scope: Scope | None = None) -> Expression:
+def parse(text: str, scope: Scope | None = None, work: Work | None = None) -> Expression:
     """Read an expression.  With a `scope` names are resolved at once, else by the model.
+
+    `work` counts what all expressions of a file take.
 
     Raises:
         ModelError: with line and column inside `text`, counted from 1.
     """
-    parser = _Parser(text, scope)
+    parser = _Parser(text, scope, work or Work())
     result = parser.whole()
-    if depth(result) > 3 * MAXIMUM_DEPTH:
+    # a token adds at most three levels
+    if len(parser.tokens) > MAXIMUM_DEPTH and depth(result) > 3 * MAXIMUM_DEPTH:
         raise parser.error(f"an expression nested deeper than {3 * MAXIMUM_DEPTH} levels", 0)
     return result

@@ -222,63 +222,16 @@ def in_process(arguments: Iterable[object], **environment: str) -> Any:
 # -- other programs ------------------------------------------------------------------------------------
 
 
-def factors(matrices: Any) -> tuple[Any, Any] | None:
-    """T [s, t] and O [t, o] with K_o = T diag(O_o), if the joint kernel [o] factors."""
-    import numpy as np
-    from scipy.sparse import csr_array, diags_array
+def write_problem(pomdp: Any, path: Path) -> str:
+    """Write the arrays in Cassandra's format; why that can't be done, or ""."""
+    from factored_polca.formats.cassandra import write_factored
+    from factored_polca.formats.cassandra_factoring import factored
+    from factored_polca.models import ModelError
 
-    total = csr_array(sum(matrices[1:], start=matrices[0]))
-    reached = np.asarray(total.sum(axis=0))
-    rates = [np.asarray(matrix.sum(axis=0)) / np.where(reached > 0, reached, 1.0) for matrix in matrices]
-    rates[0][reached == 0] = 1.0  # never needed, but rows have to sum to 1
-    for matrix, rate in zip(matrices, rates, strict=True):
-        if abs(matrix - total @ diags_array(rate)).max() > 1e-9:
-            return None
-    seen = np.column_stack(rates)
-    # Rounding leaves probabilities just above 1, which other programs refuse.
-    sums = total.sum(axis=1)
-    scale = diags_array(1.0 / np.where(sums > 0, sums, 1.0))
-    return csr_array(scale @ total), seen / seen.sum(axis=1, keepdims=True)
-
-
-def write_pomdp(pomdp: Any, path: Path) -> str:
-    """Write the arrays in Cassandra's format; why that can't be done, or "".
-
-    Terminal states become one that is never left.  What is seen of the state is not written, so it must
-    not be news: class and action have to foretell it.
-    """
-    import numpy as np
-    from scipy.sparse import coo_array, csr_array
-
-    states, end = pomdp.states, np.flatnonzero(pomdp.terminal)
-    place = np.arange(states)
-    place[end] = end[:1]
-    merged = csr_array((np.ones(states), (np.arange(states), place)), shape=(states, states))
-    stay = csr_array((np.ones(len(end)), (end, end)), shape=(states, states))
-    names = sorted({name for row in pomdp.observations for name in row})
-    lines = [f"discount: {pomdp.discount!r}", "values: reward", f"states: {states}"]
-    lines += [f"actions: {len(pomdp.actions)}", f"observations: {len(names)}"]
-    belief = pomdp.initial @ merged
-    lines.append("start: " + " ".join(f"{p:.17g}" for p in (belief / belief.sum()).tolist()))
-    foretold = len(np.unique(pomdp.observed[pomdp.initial > 0])) == 1
-    for a, matrices in enumerate(pomdp.kernel):
-        found = factors([csr_array(matrix @ merged) for matrix in matrices])
-        if found is None:
-            return "the observation depends on more than the action and the next state"
-        moves, seen = coo_array(found[0]), found[1]
-        pairs = np.column_stack([pomdp.observed[moves.row], pomdp.observed[moves.col]])
-        followers = np.unique(pairs, axis=0)
-        foretold = foretold and len(np.unique(followers[:, 0])) == len(followers)
-        moves = coo_array(found[0] + stay)
-        table = zip(moves.row.tolist(), moves.col.tolist(), moves.data.tolist(), strict=True)
-        lines += [f"T: {a} : {s} : {t} {p:.17g}" for s, t, p in table]
-        for label, rates in zip(pomdp.observations[a], seen.T.tolist(), strict=True):
-            o = names.index(label)
-            lines += [f"O: {a} : {t} : {o} {p:.17g}" for t, p in enumerate(rates) if p]
-        lines += [f"R: {a} : {s} : * : * {r:.17g}" for s, r in enumerate(pomdp.rewards[a].tolist()) if r]
-    if not foretold:
-        return "what is seen of the state is news beside the observation"
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    try:
+        path.write_text(write_factored(factored(pomdp, as_mdp=False)), encoding="ascii")
+    except ModelError as error:
+        return error.faults[0].message
     return ""
 
 
@@ -352,6 +305,8 @@ def run_zmdp(program: str, file: Path, pomdp: Any, gap: float, seconds: float, n
 
 def run_pomdp_solve(program: str, file: Path, pomdp: Any, gap: float, seconds: float, name: str) -> Row:
     """Exact value iteration; a Bellman residual r bounds the error by discount r / (1 - discount)."""
+    from factored_polca.formats.alpha_file import read_alpha
+
     ratio = pomdp.discount / (1 - pomdp.discount)
     command = [
         program, "-pomdp", str(file), "-o", "found", "-stop_criteria", "bellman",
@@ -363,15 +318,9 @@ def run_pomdp_solve(program: str, file: Path, pomdp: Any, gap: float, seconds: f
     if "Solution found" not in text or not alphas.exists() or not residuals:
         epochs = re.findall(r"Epoch: *(\d+)", text)
         return Row(name, "pomdp-solve", f"time limit in epoch {epochs[-1] if epochs else 0}", [])
-    vectors = [line.split() for line in alphas.read_text(encoding="ascii").splitlines()]
-    start_belief = pomdp.initial.tolist()
-    values = [
-        sum(float(entry) * p for entry, p in zip(row, start_belief, strict=True))
-        for row in vectors
-        if len(row) == pomdp.states and pomdp.states > 1
-    ]
+    value = read_alpha(alphas.read_text(encoding="ascii"), pomdp).value(pomdp.initial)
     error = float(residuals[-1][1]) * ratio
-    record = (used, max(values) - error, max(values) + error)
+    record = (used, value - error, value + error)
     reached = used if 2 * error <= gap * 1.01 else None
     return Row(
         name, "pomdp-solve", status_of([record], reached), [record], reached, vectors=residuals[-1][0]
@@ -401,7 +350,7 @@ def run_peers(name: str, gap: float, seconds: float, leave_out: list[str]) -> It
             own = data_file(re.sub(r"\W+", "_", name).strip("_") + ".pomdpx")
             if peer == "pomdpsol" and own is not None:
                 file = Path(shutil.copy(own, folder))
-            elif reason := write_pomdp(pomdp, file):
+            elif reason := write_problem(pomdp, file):
                 leave_out.append(f"{peer} on {name}: {reason}")
                 continue
             yield PEERS[peer](program, file, pomdp, gap, seconds, name)
