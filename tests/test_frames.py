@@ -115,6 +115,25 @@ def test_figures_have_rows() -> None:
     assert frame["none"].isna().tolist() == [False, True]
 
 
+def test_figure_4c_has_a_row_for_each_method_and_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    from factored_polca.studies.q_values import QValueStudy
+
+    learner = {
+        "name": "HSMQ", "discount": 1.0, "stored_values": 11_000, "visited": 10_000, "final_return": 7.0,
+        "episodes_to_optimum": 500,
+    }  # fmt: skip
+    polca = {
+        "discount": 0.95, "q_values": 1520, "q_applicable": 1400, "q_classes": 1073,
+        "q_classes_shared": 528, "return": 3.8,
+    }  # fmt: skip
+    data = {"domains": [{"domain": "Taxi", "learners": [learner], "polca": [polca]}]}
+    monkeypatch.setattr(QValueStudy, "to_data", lambda _: data)
+    frame = QValueStudy((), 0, 0.02, (), 0.0).to_frame()
+    assert frame["stored_values"].tolist() == [11_000, 1520, 1400, 1073, 528]
+    assert frame["method"][4] == "PolCA q_classes_shared"
+    assert frame["episodes_to_optimum"][0] == 500
+
+
 def test_what_has_no_rows_is_named() -> None:
     with pytest.raises(TypeError, match=r"int has no rows; what has: .*Partition"):
         columns(3)

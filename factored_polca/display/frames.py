@@ -186,6 +186,23 @@ def rewards_columns(study: Any) -> Columns:
     return {"policy": names, "step": steps, "cumulative_reward": means, "standard_error": errors}
 
 
+def q_values_columns(study: Any) -> Columns:
+    """Figure 4c: a row for each method and each of PolCA's counts: values stored, visited, the return."""
+    rows = []
+    for domain in study.to_data()["domains"]:
+        name = domain["domain"]
+        for one in domain["learners"]:
+            row = {"domain": name, "method": one["name"], "discount": one["discount"]}
+            row |= {"stored_values": one["stored_values"], "visited": one["visited"]}
+            row |= {"return": one["final_return"], "episodes_to_optimum": one["episodes_to_optimum"]}
+            rows.append(row)
+        for one in domain["polca"]:
+            for count in ("q_values", "q_applicable", "q_classes", "q_classes_shared"):
+                row = {"domain": name, "method": f"PolCA {count}", "discount": one["discount"]}
+                rows.append(row | {"stored_values": one[count], "return": one["return"]})
+    return by_column(rows)
+
+
 FRAMED_BY: Final[dict[str, Callable[[Any], Columns]]] = {
     "hierarchy.plan.HierarchicalPlan": plan_columns,
     "hierarchy.pomdp_plan.PomdpPlan": plan_columns,
@@ -204,5 +221,6 @@ FRAMED_BY: Final[dict[str, Callable[[Any], Columns]]] = {
     "simulation.comparison.Comparison": comparison_columns,
     "studies.parameters.ParameterStudy": parameters_columns,
     "studies.rewards.RewardStudy": rewards_columns,
+    "studies.q_values.QValueStudy": q_values_columns,
 }
 """Class -> the function that reads its rows."""

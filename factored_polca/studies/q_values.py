@@ -31,6 +31,7 @@ from factored_polca.baselines import (
 )
 from factored_polca.baselines.learning import CLOSE, optimal_values
 from factored_polca.baselines.process import MAXIMUM_STATES
+from factored_polca.drawn import Framed
 from factored_polca.hierarchy import Options, plan_mdp
 from factored_polca.hierarchy.counts import QValueCounts
 from factored_polca.hierarchy.plan import total_counts
@@ -114,7 +115,7 @@ class TaxiStudy:
 
 
 @dataclass(frozen=True)
-class QValueStudy:
+class QValueStudy(Framed):
     """Both domains."""
 
     settings: tuple[tuple[str, object], ...]
