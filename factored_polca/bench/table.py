@@ -23,8 +23,8 @@ NOTES = (
     "memory: the largest resident set of the process; numpy, scipy and the loaded kernels take "
     "{before:,.0f} MiB of it before there is a model",
     "peer: the quicker one of Storm's two engines on the model written as a PRISM program; its seconds are "
-    "of building and minimising, without starting and parsing; it counts reachable states only, and blocks "
-    "by its own criterion; — where it was not asked",
+    "of building and minimising, without starting and parsing; from all states, but dd tells no actions by "
+    "name, and sparse has a state before the start; — where it was not asked",
 )
 
 
