@@ -2,7 +2,8 @@
 
     console      commands, and what each prints, compared as in README; a line `error: ...` at the end is
                  what a command that fails says
-    python       run; a comment behind a `print` at a line's start is what it prints
+    python       run; a comment behind a `print` at a line's start is what it prints; where the first line
+                 is a comment with the name of a file, as in `# qmdp.py`, it is that file too
     others       a block whose first line is a comment with the name of a file, as in `# lamp.toml` or
                  `<!-- lamp.pomdpx -->`, is that file
 
@@ -30,12 +31,13 @@ def run_page(page: Path, capsys: pytest.CaptureFixture[str]) -> int:
     for kind, block in re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
         if kind == "console":
             ran += run_commands(block, capsys)
-        elif kind == "python":
-            run_code(block, capsys)
-            ran += 1
-        elif kind not in ("text", "output") and (name := _FILE.match(block)):
+            continue
+        if kind not in ("text", "output") and (name := _FILE.match(block)):
             # a document type must come first in XML, and comments after it are fine
             Path(name[1]).write_text(block, encoding="utf-8")
+        if kind == "python":
+            run_code(block, capsys)
+            ran += 1
     return ran
 
 

@@ -28,7 +28,9 @@ from factored_polca.models.scalars import scalar
 from factored_polca.solvers import solve_mdp
 from factored_polca.symbolic import compile_model, reachable_states
 
-PROGRAMS = range(24)
+# In the seeds left out overlapping commands of a DTMC make a step of many outcomes: the plain evaluator of
+# `enumerate_model` needs a minute for them.
+PROGRAMS = [seed for seed in range(30) if seed not in (2, 4, 6, 7, 13, 21, 22, 25)]
 BLOCKS = [
     seed for seed in range(112) if seed not in (16, 45)
 ]  # which need floor(): Storm's exact quotient has none
