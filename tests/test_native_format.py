@@ -775,3 +775,26 @@ def test_the_template_reads_and_checks_clean(name: str) -> None:
     assert document.model.states == 15  # 5 cells x 3 places of the parcel
     mdp = enumerate_model(document.model)  # raises where a row does not sum to 1
     assert mdp.states == 15
+
+
+def test_reading_stops_after_a_thousand_faults() -> None:
+    text = "discount = 0.5\n[features]\nx = 'boolean'\n[actions.a]\n"
+    text += "\n".join(f"[actions.b{k}]\nreward = 'y'" for k in range(3000))
+    with pytest.raises(ModelError) as caught:
+        read_native(text)
+    faults = caught.value.faults
+    assert len(faults) == 1001
+    assert "reading stopped: there are 1000 faults" in faults[-1].message
+    assert all(fault.line > 1 for fault in faults)
+
+
+def test_what_is_missing_has_the_place_where_the_file_begins() -> None:
+    with pytest.raises(ModelError) as caught:
+        read_native("[features]\nx = 'boolean'\n")
+    assert {(fault.line, fault.column) for fault in caught.value.faults} == {(1, 1)}
+
+
+def test_a_switch_of_many_cases_is_read_in_time_that_grows_with_them() -> None:
+    cases = ", ".join(f"{k}: {k}" for k in range(50_000))
+    text = f"discount = 0.5\nreward = 'switch(x, {cases})'\n[features]\nx = '0..49999'\n[actions.a]\n"
+    assert len(read_native(text).model.rewards) == 1
