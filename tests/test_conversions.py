@@ -12,7 +12,7 @@ from factored_polca.cli import main
 from factored_polca.formats import FORMATS, read, write
 from factored_polca.models import Action, Feature, Model, Observation
 
-EXTENSIONS = sorted(FORMATS)
+EXTENSIONS = sorted(set(FORMATS) - {".prism", ".nm", ".pm", ".rddl"})  # those need extras
 
 
 def lamp(observability: str) -> Model:

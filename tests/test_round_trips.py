@@ -18,10 +18,10 @@ import pytest
 from factored_polca import library
 from factored_polca.explicit.dynamic_programming import value_iteration
 from factored_polca.explicit.enumeration import enumerate_model
-from factored_polca.formats import FORMATS, Document
+from factored_polca.formats import FORMATS, Document, spudd_trees
 from factored_polca.minimisation import flat_process, minimise
 from factored_polca.minimisation.unreduced import unreduced_pomdp
-from factored_polca.models import FALSE, Action, Feature, Model, ModelError, Observation
+from factored_polca.models import FALSE, Action, Feature, Model, ModelError, Observation, work
 from factored_polca.solvers.pomdp_choose import solve_pomdp
 from factored_polca.symbolic import compile_model
 
@@ -189,3 +189,16 @@ def test_terminal_states_are_absorbing_and_earn_nothing(extension: str, observab
     going, best = solve_pomdp(pomdp, "blind"), solve_pomdp(pomdp, "fib")
     assert going.lower == pytest.approx(value, abs=1e-6)  # to go is best wherever one may be
     assert best.upper == pytest.approx(value, abs=1e-6)
+
+
+@pytest.mark.parametrize("extension", [".toml", ".dat", ".pomdpx"])
+@pytest.mark.parametrize(("domain", "size"), [("components", "16"), ("sysadmin", "24")])
+def test_files_of_ten_million_states_are_read_in_few_steps(
+    domain: str, size: str, extension: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Readers count tokens and nodes: 60,000 are enough, where there are 10^7 states and more."""
+    for module in (spudd_trees, work):
+        monkeypatch.setattr(module, "MAXIMUM_STEPS", 60_000)
+    model = library.load(domain, {"size": size}).model
+    assert model.states > 10**7
+    assert again(Document(model), extension).model.states == model.states

@@ -12,11 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Union
+from typing import Any, Final, Union
 
 import numpy as np
 
 from factored_polca.diagrams import Diagram, Manager, choose, combine, leaves, relabel
+from factored_polca.models.errors import LimitReached
 from factored_polca.models.expressions import (
     Conditional,
     Constant,
@@ -44,6 +45,9 @@ class Distribution:
     kinds: tuple[type, ...]
 
 
+MAXIMUM_TABLE: Final = 250_000
+"""Different values of all expressions of a model; each takes a place in a table, and leaves of diagrams."""
+
 TableValue = Union[Scalar, Distribution, Undefined]
 
 Variable = Union[Feature, Observation]
@@ -61,6 +65,12 @@ class ValueTable:
         """The number of `value`, a new one if need be."""
         key = (type(value), value)
         if key not in self.numbers:
+            if len(self.values) >= MAXIMUM_TABLE:
+                raise LimitReached(
+                    f"the model's expressions take more than {MAXIMUM_TABLE:,} different values, as a "
+                    "product of many factors does: split sums into terms, or use fewer features in one",
+                    "compiling the model",
+                )
             self.numbers[key] = len(self.values)
             self.values.append(value)
         return self.numbers[key]

@@ -20,6 +20,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import networkx as nx
+import numpy as np
 
 from factored_polca.models import Model, TaskHierarchy
 from factored_polca.models.expressions import Expression, references
@@ -118,7 +119,10 @@ def spectral(order: Sequence[str], found: Sequence[Group]) -> list[str]:
     for component in nx.connected_components(graph):
         members = [name for name in order if name in component]
         if len(members) > 2:
-            members = list(nx.spectral_ordering(graph.subgraph(members), seed=0))
+            # networkx's own spectral_ordering iterates without end on some graphs
+            _, vectors = np.linalg.eigh(nx.laplacian_matrix(graph, nodelist=members).toarray())
+            fiedler = vectors[:, 1]  # of the second smallest eigenvalue
+            members = [members[i] for i in np.argsort(fiedler, kind="stable")]
             if list(order).index(members[0]) > list(order).index(members[-1]):
                 members.reverse()
         result.extend(members)
