@@ -377,3 +377,12 @@ def test_a_restriction_to_reachable_states_keeps_the_value() -> None:
     assert restricted.polled.value == pytest.approx(everywhere.polled.value, abs=1e-10)
     for a, b in zip(restricted.solved, everywhere.solved, strict=True):
         assert a.reduction.partition.blocks <= b.reduction.partition.blocks
+
+
+def test_plans_and_what_belongs_to_them_are_short_in_messages() -> None:
+    taxi = library.load("taxi")
+    found = plan_mdp(taxi.model, taxi.tasks)
+    assert repr(found).startswith("<HierarchicalPlan of taxi: 7 tasks, worth 3.857")
+    assert repr(found.root) == f"<SolvedTask Root: 55 blocks, worth {found.root.value:.6g}>"
+    assert repr(found.root.reduction) == "<Reduction of taxi: 55 blocks>"
+    assert all(len(repr(one)) < 200 for one in (found, *found.solved, found.symbolic))

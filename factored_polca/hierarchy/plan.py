@@ -78,6 +78,10 @@ class HierarchicalPlan(DrawnGraph, Framed):
     seconds: float
     warnings: tuple[str, ...] = field(default=())
 
+    def __repr__(self) -> str:
+        tasks, worth = len(self.solved), self.polled.value
+        return f"<HierarchicalPlan of {self.model.name}: {tasks} tasks, worth {worth:.6g}>"
+
     @property
     def root(self) -> SolvedTask:
         """The task at the top."""

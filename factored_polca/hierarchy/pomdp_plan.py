@@ -82,6 +82,9 @@ class PomdpPlan(DrawnGraph, Framed):
     seconds: float
     warnings: tuple[str, ...] = field(default=())
 
+    def __repr__(self) -> str:
+        return f"<PomdpPlan of {self.model.name}: {len(self.solved)} tasks>"
+
     @property
     def root(self) -> SolvedPomdpTask:
         """The task at the top."""

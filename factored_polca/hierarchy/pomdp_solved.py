@@ -61,6 +61,9 @@ class SolvedPomdpTask(DrawnGraph):
         """The task's own upper bound at the initial belief."""
         return self.solution.upper
 
+    def __repr__(self) -> str:
+        return f"<SolvedPomdpTask {self.task.name}: {self.reduction.partition.blocks:,} blocks>"
+
     @property
     def corner_gap(self) -> float:
         """The largest upper - lower at the beliefs that the task was solved for."""

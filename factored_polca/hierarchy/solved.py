@@ -32,3 +32,7 @@ class SolvedTask(DrawnGraph):
     seconds: float
     dead_end_states: int = 0
     warnings: tuple[str, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        blocks = self.reduction.partition.blocks
+        return f"<SolvedTask {self.task.name}: {blocks:,} blocks, worth {self.value:.6g}>"

@@ -40,6 +40,10 @@ class Reduction(DrawnGraph, Framed):
     minimisation: Minimisation
     quotient: Quotient | PomdpQuotient
 
+    def __repr__(self) -> str:
+        name, partition = self.process.symbolic.model.name, self.partition
+        return f"<{type(self).__name__} of {name}: {partition.blocks:,} blocks>"
+
     @property
     def pomdp_quotient(self) -> PomdpQuotient:
         """The quotient of a partially observed process.
@@ -137,7 +141,7 @@ class Reduction(DrawnGraph, Framed):
         return relabel(self.partition.diagram, np.append(images, np.uint64(none)), INDEX)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class InterchangeableReduction(Reduction):
     """A reduction by what actions do, whatever their names; a policy takes classes of equal signatures.
 

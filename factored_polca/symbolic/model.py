@@ -91,6 +91,9 @@ class SymbolicModel:
     warnings: tuple[Fault, ...] = ()
     positions: tuple[int, ...] = field(default=())  # [feature] -> position in the order
 
+    def __repr__(self) -> str:
+        return f"<SymbolicModel {self.model.name}: order {', '.join(self.order)}>"
+
     def now(self, feature: int) -> int:
         """The level of a feature in the present state."""
         return 2 * self.positions[feature]
