@@ -63,6 +63,7 @@ def _refusal(reader: Reader, data: bytes, error: ModelError) -> Finding | None:
     if bad := unprintable(shown):
         return Finding(f"U+{ord(bad):04X} in an error", shown)
     text = data.decode("utf-8", "replace").replace("\r\n", "\n")
+    plain = text.split("\n")
     lines = (text.replace("\r", "\n") if reader.file.endswith(".pomdpx") else text).split("\n")
     for fault in error.faults:
         if len(str(fault)) > LONGEST_FAULT:
@@ -73,7 +74,8 @@ def _refusal(reader: Reader, data: bytes, error: ModelError) -> Finding | None:
             continue
         if fault.line < 1 or fault.column < 1:
             return Finding(f"no place: {_words(fault.message)}", str(fault))
-        if fault.line > len(lines) or fault.column > len(lines[fault.line - 1]) + 1:
+        seen = plain if "is no UTF-8" in fault.message else lines  # bytes are counted before XML is read
+        if fault.line > len(seen) or fault.column > len(seen[fault.line - 1]) + 1:
             return Finding(f"a place outside the text: {_words(fault.message)}", str(fault))
     return None
 
