@@ -40,7 +40,7 @@ def test_a_written_problem_is_the_problem(benchmark, domain, parameters, tmp_pat
     model = library.load(domain, parameters).model
     pomdp = unreduced_pomdp(compile_model(model), reachable=True)
     file = tmp_path / "problem.pomdp"
-    assert benchmark.write_pomdp(pomdp, file) == ""
+    assert benchmark.write_problem(pomdp, file) == ""
     lines = [line.split() for line in file.read_text(encoding="ascii").splitlines()]
     assert all(0 <= float(line[-1]) <= 1 for line in lines if line[0] in ("T:", "O:"))
     assert all(0 <= float(entry) <= 1 for line in lines if line[0] == "start:" for entry in line[1:])

@@ -383,22 +383,30 @@ def test_quiet_leaves_stderr_empty(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == ""
 
 
-def test_markup_and_control_characters_in_names_are_shown_as_they_are(
-    run_text: Run, run_json: Run, folder: Path
-) -> None:
-    name = "[red]no markup[/] :smile: \x1b[31m"
+def test_markup_in_names_is_shown_as_it_is(run_text: Run, run_json: Run, folder: Path) -> None:
+    name = "[red]no markup[/] :smile:"
     text = (
-        r'name = "[red]no markup[/] :smile: \u001b[31m"'
-        + "\ndiscount = 0.9\nreward = [1, 'a == \"[/]\"']\n[features]\n"
+        'name = "[red]no markup[/] :smile:"'
+        "\ndiscount = 0.9\nreward = [1, 'a == \"[/]\"']\n[features]\n"
         'a = ["[bold]", "[/]"]\n[actions.go]\neffects.a = \'{"[bold]": 1/2, "[/]": 1/2}\'\n'
     )
     (folder / "odd.toml").write_text(text, encoding="utf-8")
     for command in ("info", "minimise", "plan"):
         printed = run_text(command, "odd.toml")
-        assert r"[red]no markup[/] :smile: \x1b[31m" in printed
-        assert "\x1b" not in printed
+        assert name in printed
     assert "[bold], [/]" in run_text("info", "odd.toml")
     assert run_json("info", "odd.toml")["model"] == name
+
+
+def test_control_characters_in_names_are_refused_and_shown_as_escapes(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = 'name = "odd \\u001b[31m"\ndiscount = 0.9\n[features]\na = "0..1"\n[actions.go]\n'
+    (folder / "odd.toml").write_text(text, encoding="utf-8")
+    assert main(["info", "odd.toml"]) == 2
+    said = capsys.readouterr().err
+    assert "odd.toml:1:8: " in said
+    assert "\x1b" not in said
 
 
 def test_escape_leaves_letters_of_all_scripts() -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from factored_polca.diagrams import MERSENNE_61, Field, is_prime, random_prime
-from factored_polca.diagrams.field import field_add, field_subtract, multiply_all
+from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
 
 PRIMES = [MERSENNE_61, *(random_prime(random.Random(seed)) for seed in range(4))]
 
@@ -24,6 +24,17 @@ def sums(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], p: np.uint64) -> 
     for i in range(len(a)):
         result[0, i] = field_add(a[i], b[i], p)
         result[1, i] = field_subtract(a[i], b[i], p)
+    return result
+
+
+@numba.njit
+def multiply_all(
+    a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], p: np.uint64, inverse: np.uint64
+) -> npt.NDArray[np.uint64]:
+    """Elementwise products of stored forms."""
+    result = np.empty_like(a)
+    for i in range(len(a)):
+        result[i] = field_multiply(a[i], b[i], p, inverse)
     return result
 
 

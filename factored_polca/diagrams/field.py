@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import inline, kernel
+from factored_polca.diagrams.jit import inline
 
 MERSENNE_61 = 2**61 - 1
 """The first prime of every computation."""
@@ -69,15 +69,6 @@ def field_subtract(a: np.uint64, b: np.uint64, prime: np.uint64) -> np.uint64:
     if a >= b:
         return a - b
     return a + prime - b
-
-
-@kernel
-def multiply_all(a: UInt64Array, b: UInt64Array, prime: np.uint64, inverse: np.uint64) -> UInt64Array:
-    """Elementwise product of two arrays in Montgomery form."""
-    result = np.empty_like(a)
-    for i in range(len(a)):
-        result[i] = field_multiply(a[i], b[i], prime, inverse)
-    return result
 
 
 def is_prime(n: int) -> bool:

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import time
 
-from factored_polca.diagrams import INDEX, dump, load, states_of_leaves
+from factored_polca.diagrams import INDEX, Field, dump, load, states_of_leaves
 from factored_polca.diagrams.jit import compiled_before
+from factored_polca.diagrams.nodes import STEPS
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.plan import plan_mdp
 from factored_polca.models import Action, Feature, Model
+from factored_polca.symbolic import NumericView
+from factored_polca.symbolic.forward import ForwardRegression
 
 
 def tiny_model() -> Model:
@@ -35,5 +38,8 @@ def warm_up() -> float:
     policy, manager = found.root.policy, found.symbolic.manager
     states_of_leaves(policy, found.symbolic.now_levels)
     load(manager, dump(policy), INDEX)
+    manager.indicator(found.symbolic.now(0), [0])
+    numbers = NumericView(found.symbolic, Field())
+    ForwardRegression(numbers, 1, numbers.weights(1, 1)[0]).run(STEPS)
     manager.collect_garbage()
     return time.perf_counter() - began

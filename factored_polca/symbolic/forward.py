@@ -127,7 +127,7 @@ class ForwardRegression:
         self.next_weights = np.zeros(entries, dtype=np.uint64)
         self.next_rows = np.zeros(room * len(self.carried), dtype=np.int32)
         self.hashes = np.zeros(room, dtype=np.uint64)
-        self.slots = np.zeros(1 << (4 * room).bit_length(), dtype=np.int32)
+        self.slots = self._slots(1 << (4 * room).bit_length(), 0)
         self.child_items.append(np.zeros(size * self.items, dtype=np.int32))
         self.state[[ITEM, VALUE, ITEMS, ENTRIES]] = 0
         feature = self.features[self.place]
@@ -171,9 +171,13 @@ class ForwardRegression:
         for name in ("next_numbers", "next_weights", "next_rows", "next_first", "hashes"):
             array = getattr(self, name)
             setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
-        slots = np.zeros(2 * len(self.slots), dtype=np.int32)
-        place_all(self.hashes, int(self.state[ITEMS]), slots)
-        self.slots = slots
+        self.slots = self._slots(2 * len(self.slots), int(self.state[ITEMS]))
+
+    def _slots(self, size: int, items: int) -> Int32Array:
+        """A table of so many slots that finds the items there are."""
+        slots = np.zeros(size, dtype=np.int32)
+        place_all(self.hashes, items, slots)
+        return slots
 
     def _join(self) -> Diagram:
         """The nodes of all items, leaves first."""
