@@ -405,7 +405,7 @@ def test_control_characters_in_names_are_refused_and_shown_as_escapes(
     (folder / "odd.toml").write_text(text, encoding="utf-8")
     assert main(["info", "odd.toml"]) == 2
     said = capsys.readouterr().err
-    assert "odd.toml:1:8: " in said
+    assert "odd.toml:1:9: " in said
     assert "\x1b" not in said
 
 
