@@ -18,6 +18,12 @@ def square(n: int, seed: int) -> dict[str, Any]:
     return {"square": n * n, "blocks": n}
 
 
+def unhurried(n: int, seed: int) -> dict[str, Any]:
+    """Done after a quarter of a second."""
+    time.sleep(0.25)
+    return {"square": n * n, "blocks": n}
+
+
 def endless(seed: int) -> dict[str, Any]:
     """Never done; it computes."""
     while True:

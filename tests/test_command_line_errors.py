@@ -205,7 +205,7 @@ def test_a_memory_error_of_the_machine_is_a_limit(fail: Fail, monkeypatch: pytes
 
 @pytest.mark.parametrize("command", ["minimise", "plan"])
 def test_too_little_time_is_a_limit(fail: Fail, command: str) -> None:
-    message = fail(3, command, "expon", "--set", "size=14", "--time", "1", "-q", "--json")
+    message = fail(3, command, "expon", "--set", "size=18", "--time", "1", "-q", "--json")
     assert "limit reached" in message
     assert "time limit" in message
 
