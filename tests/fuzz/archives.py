@@ -153,7 +153,7 @@ def _changed_array(c: Choices, data: bytes) -> bytes:
     """Numbers of an array become others; its shape or type changes."""
     try:
         array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False).copy()
-    except (ValueError, tokenize.TokenError, SyntaxError):  # it has been changed before
+    except (ValueError, tokenize.TokenError, SyntaxError, MemoryError):  # it has been changed before
         return data
     match c.below(5):
         case 0:
