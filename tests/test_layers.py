@@ -20,7 +20,8 @@ PACKAGE = ROOT / "factored_polca"
 MODELS = {"models", "drawn"}
 SYMBOLIC = {"symbolic", "diagrams", *MODELS}
 MINIMISATION = {"minimisation", "explicit", *SYMBOLIC}
-HIERARCHY = {"hierarchy", "solvers", "formats", *MINIMISATION}
+SOLVING = {"solvers", *MINIMISATION}
+HIERARCHY = {"hierarchy", "approximation", "structured", "formats", *SOLVING}
 CONTROL = {"control", "hierarchy", *MINIMISATION}
 
 MAY_IMPORT: dict[str, set[str]] = {
@@ -33,6 +34,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "formats": {"explicit", *MODELS},
     "minimisation": MINIMISATION,
     "solvers": {"explicit", *MODELS},
+    "approximation": SOLVING,
+    "structured": SOLVING,
+    "parametric": SOLVING,
     "hierarchy": HIERARCHY,  # plan files hold the model in the native format
     "control": CONTROL,
     "simulation": {"control", "hierarchy", "explicit", *SYMBOLIC},  # what it runs is a hierarchy's plan
@@ -40,11 +44,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "external": {"simulation", "solvers", "formats", "explicit", *SYMBOLIC},
     # the kit for other packages' tests reads everything that it checks
     "testing": {"simulation", "control", *HIERARCHY},
-    "studies": {"display", "baselines", "simulation", "control", "library", *HIERARCHY},
+    "studies": {"parametric", "display", "baselines", "simulation", "control", "library", *HIERARCHY},
     "baselines": {"simulation", "control", *HIERARCHY},
-    "display": {"simulation", "control", "library", *HIERARCHY},
+    "display": {"parametric", "simulation", "control", "library", *HIERARCHY},
     # what runs other models, whole programs and peers, and draws what came of it
     "bench": {
+        "parametric",
         "studies",
         "external",
         "display",
@@ -55,7 +60,18 @@ MAY_IMPORT: dict[str, set[str]] = {
         *HIERARCHY,
     },
     # from the top package: the version
-    "cli": {"bench", "studies", "display", "baselines", "simulation", "control", "library", "", *HIERARCHY},
+    "cli": {
+        "bench",
+        "studies",
+        "display",
+        "parametric",
+        "baselines",
+        "simulation",
+        "control",
+        "library",
+        "",
+        *HIERARCHY,
+    },
     "__main__": {"cli"},
 }
 

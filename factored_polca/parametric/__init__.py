@@ -1,0 +1,1 @@
+"""Models whose parameters stay symbols: one minimisation for all their values."""
