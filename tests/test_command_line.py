@@ -449,3 +449,35 @@ def test_a_pipe_that_closes_early_is_no_traceback(arguments: list[str]) -> None:
     assert process.returncode == 1
     assert "Traceback" not in err
     assert "BrokenPipe" not in err
+
+
+@pytest.mark.parametrize("kind", ["q", "value", "action"])
+def test_a_plan_stored_over_classes_acts_alike(run_json: Run, run_text: Run, kind: str) -> None:
+    whole = run_json("plan", "taxi", "--set", "size=3", "-o", "whole.polca")
+    less = run_json("plan", "taxi", "--set", "size=3", "-o", "less.polca", "--store", kind)
+    assert less["stored"]["by"] == kind
+    assert less["stored"]["blocks"] == sum(row["blocks"] for row in whole["tasks"])
+    assert less["stored"]["classes"] == sum(row["value_classes"][kind] for row in whole["tasks"])
+    assert less["stored"]["classes"] < less["stored"]["blocks"]
+    for name in ("whole", "less"):
+        run_json("simulate", f"{name}.polca", "--episodes", "50")
+    assert without_times(run_json("simulate", "whole.polca", "--episodes", "50")) == without_times(
+        run_json("simulate", "less.polca", "--episodes", "50")
+    )
+    shown = run_text("plan", "toy", "-o", "toy.polca", "--store", kind, "-q")
+    assert f"stored by {kind}: " in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("plan", "toy", "--store", "q"), "give -o PLAN too"),
+        (("plan", "tiger", "--store", "q", "-o", "x.polca"), "whose state is seen"),
+        (("plan", "toy", "--store", "q", "-o", "x.polca", "--interchangeable"), "needs actions by name"),
+    ],
+)
+def test_what_cannot_be_stored_over_classes_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str
+) -> None:
+    assert main(list(arguments)) == 2
+    assert said in capsys.readouterr().err

@@ -122,6 +122,11 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
     sub.add_argument(
+        "--store", default="blocks", choices=("blocks", "q", "value", "action"),
+        help="write policies over states of equal Q-values, of equal value and action, or of equal action, "
+        "not over blocks (where the state is seen)",
+    )  # fmt: skip
+    sub.add_argument(
         "--discount", type=discount, metavar="D",
         help="plan without end, with this discount: in place of the model's discount and horizon",
     )  # fmt: skip

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from factored_polca.hierarchy.irrelevance import KINDS, value_classes
 from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
+from factored_polca.hierarchy.solved import SolvedTask
+from factored_polca.minimisation.reduction import InterchangeableReduction
 
 
 def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
@@ -28,6 +31,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "q_applicable": solved.counts.q_applicable,
                 "q_classes": solved.counts.q_classes,
                 "q_classes_shared": solved.counts.q_classes_shared,
+                "value_classes": classes_by_kind(solved),
                 "value": solved.value,
                 "solver": solved.solution.method,
                 "gap": solved.solution.gap,
@@ -48,6 +52,12 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
         "order": list(plan.symbolic.order),
         "seconds": plan.seconds,
     }
+
+
+def classes_by_kind(solved: SolvedTask) -> dict[str, int]:
+    """How many classes of equal Q-values, equal values and actions, equal actions a task's states have."""
+    exchanged = isinstance(solved.reduction, InterchangeableReduction)
+    return {kind: value_classes(solved, kind).classes for kind in KINDS if not (exchanged and kind == "q")}
 
 
 def guarantee(plan: HierarchicalPlan) -> str:
