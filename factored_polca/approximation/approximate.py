@@ -1,13 +1,12 @@
 """Approximate abstraction: minimise a process that is near the process itself, and say what that may cost.
 
 1. *Snap* (`snap`): rows and rewards within epsilon become one.
-2. *Merge*: where the state is seen, blocks of the snapped process are found from the top and split only where
-   values differ by more than epsilon of their span (`aggregate`); where it is not seen, the snapped
-   process is minimised exactly.  If telling classes apart takes too much, the former is minimised exactly
-   as well.
+2. *Merge*: where the state is seen, blocks of the snapped process are found from the top and split only
+   where values differ by more than epsilon of their span (`aggregate`); where it is not seen, or telling
+   classes apart takes too much, the snapped process is minimised exactly.
 3. Solve what comes of it, and carry the policy back to the states.
-4. *Certify* (`certificate`, `lemma`): bounds on what the policy is worth, and on the optimum, in the process
-   itself.
+4. *Certify* (`certificate`, `lemma`): bounds on what the policy is worth, and on the optimum, in the
+   process itself.
 
 Execution tracks with the model itself.  With epsilon 0 all of it is exact minimisation.
 """

@@ -100,7 +100,8 @@ class Evidence:
     def chosen(self) -> BoolArray:
         """What the policy allows [choice, class]."""
         numbers = np.arange(len(self.classes.rewards))[:, None]
-        return (numbers == self.policy[self.classes.block][None, :]) & self.classes.applicable
+        allowed: BoolArray = numbers == self.policy[self.classes.block][None, :]
+        return allowed & self.classes.applicable
 
     def values(
         self, allowed: BoolArray, side: Literal["upper", "lower"], span: float

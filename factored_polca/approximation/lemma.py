@@ -26,7 +26,8 @@ bounds |D| if it does so before; it is started from (1), and every step keeps it
 the snapped model, V(b) <= R^(b, c) + gamma sum_o V(K^_o b), as point-based methods keep it.  Then in the
 model itself, tracked with its own rows, V(b) <= R(b, c) + sum_C b(C) [r_c(C) + gamma d_c(C) span] + gamma
 sum_o V(K_o b), span being that of the vectors' entries: so the policy earns at least V(b0) - sum_C b0(C)
-e(C), with the span taken over the entries and the values of both extremes."""
+e(C), with the span taken over the entries and the values of both extremes.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +40,6 @@ from factored_polca.approximation.errors import MARGIN, Errors
 from factored_polca.approximation.extremes import Game, extreme_values
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import ArrayMDP, FloatArray
-from factored_polca.minimisation import Partition
 
 STEPS: Final = 200
 """Steps of (2)."""
@@ -94,6 +94,6 @@ def block_errors(errors: Errors, mdp: ArrayMDP, span: float) -> FloatArray:
     return result
 
 
-def start_error(partition: Partition, initial: FloatArray, errors: FloatArray) -> float:
+def start_error(initial: FloatArray, errors: FloatArray) -> float:
     """sum_C b0(C) e(C), rounded up."""
     return float(initial @ errors) * (1 + 1e-9)
