@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,13 @@ from factored_polca.approximation.certificate import (
     certify_policy,
 )
 from factored_polca.approximation.errors import Errors, process_errors
-from factored_polca.approximation.lemma import block_errors, entries, start_error, uniform_error, value_span
+from factored_polca.approximation.lemma import (
+    block_errors,
+    entry_span,
+    start_error,
+    uniform_error,
+    value_span,
+)
 from factored_polca.approximation.snap import Snapped
 from factored_polca.explicit.arrays import IntArray
 from factored_polca.minimisation import DecisionProcess, Minimisation, Reduction, make_quotient, reduce
@@ -65,7 +72,7 @@ class Approximation:
     the snapped process is further from that in the process itself.  `measured_loss` is the exact loss
     where it was computed as a check."""
 
-    epsilon: float
+    epsilon: Fraction
     lower: float
     upper: float
     optimum: float
@@ -76,6 +83,12 @@ class Approximation:
     note: str
     measured_loss: float | None = None
     measured_note: str = "not asked for"
+
+    @property
+    def epsilon_text(self) -> str:
+        """Epsilon as it may be read again: 0.05 or 1/3."""
+        text = repr(float(self.epsilon))
+        return text if Fraction(text) == self.epsilon else str(self.epsilon)
 
 
 def approximate(
@@ -163,18 +176,32 @@ def certify_mdp(
     return _approximation(reduction, errors, found)
 
 
-def certify_pomdp(reduction: ApproximateReduction, solution: POMDPSolution) -> Approximation:
+def certify_pomdp(
+    reduction: ApproximateReduction, solution: POMDPSolution, *, seed: int = 0
+) -> Approximation:
     """What is certain of a solution of the quotient, the state not being seen.
 
-    The bounds are those of the quotient's solver, moved outwards by what the snapped rows may cost.
+    The bounds are those of the quotient's solver, moved outwards by what the snapped rows may cost; they are
+    never wider than what the best and the worst policy earn that see the state.
+
+    Raises:
+        LimitReached: memory or time.
+        ValueError: discount 1.
     """
     errors, quotient = reduction.errors(), reduction.pomdp_quotient
-    mdp, features = quotient.mdp, len(reduction.process.symbolic.model.features)
-    low, high = value_span(mdp, features)
-    least, largest = entries(solution.policy)
-    span = max(high, largest) - min(low, least)
-    moved = start_error(quotient.pomdp.initial, block_errors(errors, mdp, span))
-    lower, optimum = solution.lower - moved, solution.upper + moved
+    mdp, initial = quotient.mdp, quotient.pomdp.initial
+    low, high = value_span(mdp, len(reduction.process.symbolic.model.features))
+    optimum = solution.upper + start_error(initial, block_errors(errors, mdp, high - low))
+    span, lower = entry_span(solution.policy), -np.inf
+    if span is not None:
+        lower = solution.lower - start_error(initial, block_errors(errors, mdp, span))
+    seen = replace(reduction.original, channels=None)
+    try:
+        optimum = min(optimum, bound_optimum(seen, reduction.partition, seed=seed))
+        lower = max(lower, bound_optimum(seen, reduction.partition, seed=seed, worst=True))
+    except LimitReached as error:
+        if error.stage != "classes":
+            raise
     note = f"the simulation lemma with the errors of each of {reduction.partition.blocks:,} blocks"
     loss = max(optimum - lower, 0.0)
     return _approximation(reduction, errors, Certificate(lower, optimum, optimum, loss, None, 0.0, note))
@@ -183,7 +210,7 @@ def certify_pomdp(reduction: ApproximateReduction, solution: POMDPSolution) -> A
 def _approximation(reduction: ApproximateReduction, errors: Errors, found: Certificate) -> Approximation:
     discount = float(reduction.process.symbolic.model.discount)
     return Approximation(
-        float(reduction.snapped.epsilon), found.lower, found.upper, found.optimum, found.loss,
+        reduction.snapped.epsilon, found.lower, found.upper, found.optimum, found.loss,
         uniform_error(errors, discount), found.classes, found.collision_bound, found.note,
     )  # fmt: skip
 

@@ -29,7 +29,8 @@ with r, d the largest errors in block C (`errors`) and span the largest differen
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -48,8 +49,14 @@ CLASS_LIMIT: Final = 100_000
 
 ANY_NUMBER: Final = 1 << 40
 
-STEPS: Final = 3
+STEPS: Final = 8
 """Steps of the model's own dynamics that classes are told apart by, at most."""
+
+FURTHER: Final = 20_000
+"""Classes beyond which no further step is taken."""
+
+NARROW: Final = 1e-3
+"""Relative width of bounds that are narrow enough."""
 
 TIGHTENINGS: Final = 3
 """How often the span of values is taken anew from the bounds that it led to."""
@@ -76,8 +83,8 @@ class Certificate:
 class Evidence:
     """Classes, the policy on the blocks that they lead to, and by how much rewards may be wrong.
 
-    `error` [choice, block] is added to rewards for upper bounds and taken off for lower ones, once for a
-    span of 0 (`reward_error`) and `row_error` times the span of values.
+    With `errors` the classes are those of a snapped process: what rewards may be wrong by is added to them
+    for upper bounds and taken off for lower ones.
     """
 
     classes: Classes
@@ -126,13 +133,31 @@ def certify_policy(
     Args:
         process: of the unsnapped model, with the choices, masks and channels of the snapped one.
         partition: any that respects the masks.
-        steps: how many steps of the model's dynamics tell states of a block apart, from 1 on.
+        steps: by how many steps of the model's dynamics states of a block are told apart, from 1 on; fewer
+            where the bounds are narrow before or there are more than `FURTHER` classes.
 
     Raises:
         LimitReached: more than `class_limit` classes, memory or time.
         ValueError: discount 1, where a contraction is missing.
     """
-    return certificate_of(collect(process, partition, policy, steps, class_limit, seed))
+    best: Certificate | None = None
+    for evidence in looking_further(process, partition, policy, steps, class_limit, seed):
+        found = certificate_of(evidence)
+        best = found if best is None else tightened(best, found)
+        width = max(best.loss, best.upper - best.lower)
+        if width <= NARROW * max(1.0, abs(best.lower)):
+            break
+    assert best is not None
+    return best
+
+
+def tightened(before: Certificate, after: Certificate) -> Certificate:
+    """What two certificates know together."""
+    lower, upper = max(before.lower, after.lower), min(before.upper, after.upper)
+    return replace(
+        after, lower=lower, upper=upper, optimum=min(before.optimum, after.optimum),
+        loss=min(before.loss, after.loss), collision_bound=before.collision_bound + after.collision_bound,
+    )  # fmt: skip
 
 
 def certify_by_errors(
@@ -144,38 +169,39 @@ def certify_by_errors(
         LimitReached: memory or time.
         ValueError: discount 1.
     """
-    found = collect(snapped, partition, policy, 1, ANY_NUMBER, 0)
-    return certificate_of(Evidence(found.classes, found.policy, errors))
+    (evidence,) = looking_further(snapped, partition, policy, 1, ANY_NUMBER, 0)
+    return certificate_of(replace(evidence, errors=errors))
 
 
-def collect(
+def looking_further(
     process: DecisionProcess,
     partition: Partition,
     policy: IntArray,
     steps: int,
     class_limit: int,
     seed: int,
-) -> Evidence:
-    """The classes after `steps` steps, and the policy on the blocks that they lead to.
+) -> Iterator[Evidence]:
+    """The classes after one step of the process's dynamics, after two, and so on.
 
     Raises:
-        LimitReached: already after one step; further steps are left out where they take too much.
+        LimitReached: after one step already; further steps are left out where they take too much.
         ValueError: discount 1.
     """
     if not process.symbolic.model.discount < 1:
         raise ValueError("bounds on the loss need a discount below 1")
     found, chosen = find_classes(process, partition, limit=class_limit, seed=seed), policy
+    yield Evidence(found, chosen)
     for number in range(1, steps):
-        if found.count == found.partition.blocks:
-            break
+        if found.count == found.partition.blocks or found.count > FURTHER:
+            return
         try:
             after = find_classes(process, found.refined, limit=class_limit, seed=seed + number)
         except LimitReached:
-            break
+            return
         states = feature_states(found.refined)
         before = evaluate_states(found.partition.diagram, states, process.symbolic.columns())
         chosen, found = chosen[before.astype(np.int64)], after
-    return Evidence(found, chosen)
+        yield Evidence(found, chosen)
 
 
 def certificate_of(evidence: Evidence) -> Certificate:
@@ -264,13 +290,23 @@ def bound_optimum(
     steps: int = STEPS,
     class_limit: int = CLASS_LIMIT,
     seed: int = 0,
+    worst: bool = False,
 ) -> float:
     """An upper bound on the best value at b0 of `process`, from any partition that respects its masks.
+
+    With `worst` a lower bound on what the worst policy earns.
 
     Raises:
         LimitReached, ValueError: see `certify_policy`.
     """
     nothing = np.full(partition.blocks, -1, dtype=np.int64)
-    evidence = collect(process, partition, nothing, steps, class_limit, seed)
-    best, rewards = evidence.values(evidence.classes.applicable, "upper", 0.0)
-    return at_start(evidence, rewards, evidence.classes.applicable, best, "upper")
+    sign, found = -1.0 if worst else 1.0, np.inf
+    for evidence in looking_further(process, partition, nothing, steps, class_limit, seed):
+        classes = evidence.classes
+        rewards = sign * classes.rewards
+        best = extreme_values(evidence.game, rewards, classes.applicable, "upper")
+        before, new = found, at_start(evidence, rewards, classes.applicable, best, "upper")
+        found = min(before, new)
+        if before - found <= NARROW * max(1.0, abs(found)):
+            break
+    return sign * found

@@ -26,7 +26,7 @@ bounds |D| if it does so before; it is started from (1), and every step keeps it
 the snapped model, V(b) <= R^(b, c) + gamma sum_o V(K^_o b), as point-based methods keep it.  Then in the
 model itself, tracked with its own rows, V(b) <= R(b, c) + sum_C b(C) [r_c(C) + gamma d_c(C) span] + gamma
 sum_o V(K_o b), span being that of the vectors' entries: so the policy earns at least V(b0) - sum_C b0(C)
-e(C), with the span taken over the entries and the values of both extremes.
+e(C), with e of (2) for this span.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ def value_span(mdp: ArrayMDP, features: int) -> tuple[float, float]:
     return float(low.min(initial=0.0)), float(high.max(initial=0.0))
 
 
-def entries(policy: object) -> tuple[float, float]:
-    """The least and the largest entry of alpha-vectors; nothing for other policies."""
-    if not isinstance(policy, AlphaVectors):
-        return 0.0, 0.0
+def entry_span(policy: object) -> float | None:
+    """The largest difference of entries of alpha-vectors, 0 included; None for other policies."""
+    if not isinstance(policy, AlphaVectors) or policy.meaning == "heuristic":
+        return None
     low = min((float(part.vectors.min(initial=0.0)) for part in policy.sets), default=0.0)
-    return low, max((float(part.vectors.max(initial=0.0)) for part in policy.sets), default=0.0)
+    return max((float(part.vectors.max(initial=0.0)) for part in policy.sets), default=0.0) - low
 
 
 def block_errors(errors: Errors, mdp: ArrayMDP, span: float) -> FloatArray:
