@@ -181,8 +181,8 @@ def certify_pomdp(
 ) -> Approximation:
     """What is certain of a solution of the quotient, the state not being seen.
 
-    The bounds are those of the quotient's solver, moved outwards by what the snapped rows may cost; they are
-    never wider than what the best and the worst policy earn that see the state.
+    The bounds are those of the quotient's solver, moved outwards by what the snapped rows may cost; they
+    are never wider than what the best and the worst policy earn that see the state.
 
     Raises:
         LimitReached: memory or time.

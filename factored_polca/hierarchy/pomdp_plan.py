@@ -277,7 +277,7 @@ class _Planner:
         return solution
 
     def certified(self) -> CertifiedBounds | None:
-        """What no policy can exceed, by the merged flat process; a polled policy is measured, not bounded."""
+        """What no policy can exceed, by the merged flat process; the polled policy is measured."""
         root = self.solved[planning_order(self.hierarchy)[-1].name]
         if self.merging is None:
             return None
