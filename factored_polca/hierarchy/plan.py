@@ -23,12 +23,18 @@ from factored_polca.diagrams import INDEX, Diagram, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
+from factored_polca.hierarchy.merging import (
+    CertifiedBounds,
+    Evaluation,
+    merging_for,
+    policy_chain,
+    seen_flat_process,
+)
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
-from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
-from factored_polca.minimisation.criterion import policy_primitives
+from factored_polca.minimisation import DecisionProcess, Reduction, reduce
 from factored_polca.minimisation.polynomial import interchangeable_fault
 from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import (
@@ -40,7 +46,7 @@ from factored_polca.models import (
     TaskHierarchy,
     flat_task,
 )
-from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
+from factored_polca.solvers import MDPSolution, solve_mdp
 from factored_polca.solvers.pomdp_result import Demand
 from factored_polca.solvers.protocol import MdpSolver, call_mdp_solver
 from factored_polca.symbolic import SymbolicModel, compile_model
@@ -50,23 +56,13 @@ Progress = Callable[[str, str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """The value of something at the initial belief: bounds, and how it was found."""
-
-    value: float
-    lower: float
-    upper: float
-    blocks: int
-    guarantee: Guarantee
-
-
-@dataclass(frozen=True)
 class HierarchicalPlan(DrawnGraph, Framed):
     """A solved hierarchy.
 
     `solved` lists the tasks children first, the root last.  `polled` is the value of the polled
     policy under the model's own reward; `flat` the optimum without hierarchy, None where it was
-    left out, and `flat_note` says why.
+    left out, and `flat_note` says why.  Where near states were merged, `certified` bounds both without
+    exact quotients.
     """
 
     symbolic: SymbolicModel
@@ -77,6 +73,7 @@ class HierarchicalPlan(DrawnGraph, Framed):
     flat_note: str
     seconds: float
     warnings: tuple[str, ...] = field(default=())
+    certified: CertifiedBounds | None = None
 
     def __repr__(self) -> str:
         tasks, worth = len(self.solved), self.polled.value
@@ -178,13 +175,15 @@ def plan_mdp(
         planner.solve(task)
     root = planner.solved[planning_order(hierarchy)[-1].name]
     refuse_unavoidable_dead_ends(root)
-    polled = planner.polled(root)
+    certified = planner.certified(root)
+    polled = planner.polled(root, certified)
     flat, note = planner.flat(root)
     warnings = tuple(w for solved in planner.solved.values() for w in solved.warnings)
     seconds = time.perf_counter() - began
     return HierarchicalPlan(
-        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings
-    )
+        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings,
+        certified,
+    )  # fmt: skip
 
 
 class _Planner:
@@ -201,6 +200,7 @@ class _Planner:
         self.options, self.progress = options, progress
         self.solved: dict[str, SolvedTask] = {}
         self.custom = None if options.assume_observed else custom_solver(options.solver)
+        self.merging = merging_for(symbolic, options)
         self.reachable: Diagram | None = None
         if options.reachable:
             from factored_polca.symbolic.reach import reachable_states
@@ -220,6 +220,16 @@ class _Planner:
             block_limit=block_limit,
             progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
             interchangeable=self.options.interchangeable and len(process.choices) > 1,
+        )
+
+    def merged(self, name: str, process: DecisionProcess) -> Reduction:
+        """A task's reduction: exact, or of a process near it."""
+        if self.merging is None:
+            return self.reduce(name, process, self.options.block_limit)
+        return self.merging.reduce(
+            process,
+            self.options.block_limit,
+            lambda number, blocks: self.tell(name, "merge", number, blocks),
         )
 
     def optimise(
@@ -257,7 +267,7 @@ class _Planner:
             "auto" if self.options.assume_observed else solver_of(task, named_solver(self.options.solver))
         )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
-        reduction = self.reduce(task.name, process, self.options.block_limit)
+        reduction = self.merged(task.name, process)
         refuse_without_purpose(task, reduction.mdp)
         solution = self.optimise(task.name, reduction, method, self.custom if task.solver is None else None)
         if isinstance(reduction, InterchangeableReduction):
@@ -269,23 +279,51 @@ class _Planner:
         defined = relabel(reduction.partition.diagram, chosen, INDEX)
         dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
         value = expectation(reduction.project_initial(), solution.values)
+        approximation = None
+        if self.merging is not None:
+            self.tell(task.name, "certify", 0, reduction.partition.blocks)
+            approximation = self.merging.certify(reduction, solution, policy, defined)
         self.solved[task.name] = SolvedTask(
             task, reduction, solution, policy, defined, counts, value,
             time.perf_counter() - began, dead,
             task_warnings(task, reduction, solution, dead, is_child=task not in self.hierarchy.roots()),
+            approximation,
         )  # fmt: skip
         self.tell(task.name, "done", 0, reduction.partition.blocks)
 
-    def polled(self, root: SolvedTask) -> Evaluation:
+    def polled(self, root: SolvedTask, certified: CertifiedBounds | None) -> Evaluation:
         """The value of the polled policy under the model's reward."""
-        process = root.reduction.process
-        taken = policy_primitives(root.policy, root.defined, len(self.symbolic.actions))
-        choice = Choice("polled policy", root.defined, taken, root.policy)
-        rewards = {p: self.symbolic.actions[p].rewards for p in taken}
-        chain = DecisionProcess(self.symbolic, (choice,), process.terminal, rewards, process.reachable)
-        reduction = self.reduce("polled policy", chain, self.options.block_limit)
+        limit = self.options.block_limit if certified is None else self.options.flat_block_limit or 1
+        try:
+            reduction = self.reduce("polled policy", self.chain(root), limit)
+        except LimitReached:
+            if certified is None or certified.polled_lower is None:
+                raise
+            return certified.evaluation()
         solution = self.optimise("polled policy", reduction, "auto")
         return evaluate(reduction, solution)
+
+    def chain(self, root: SolvedTask) -> DecisionProcess:
+        """The Markov chain of the polled policy under the model's reward."""
+        rewards = {p: action.rewards for p, action in enumerate(self.symbolic.actions)}
+        process = replace(root.reduction.process, symbolic=self.symbolic, rewards=rewards)
+        return policy_chain(process, root.policy, root.defined)
+
+    def certified(self, root: SolvedTask) -> CertifiedBounds | None:
+        """Bounds on the polled policy's value and on the flat optimum where near states were merged."""
+        if self.merging is None:
+            return None
+        self.tell("bounds", "certify")
+        flat = seen_flat_process(self.symbolic, root.reduction.process.terminal, self.flat_reachable())
+        return self.merging.bounds(self.chain(root), flat)
+
+    def flat_reachable(self) -> Diagram | None:
+        """What the start can reach under all primitive actions, where that is asked for."""
+        if not self.options.reachable:
+            return None
+        from factored_polca.symbolic.reach import reachable_states
+
+        return reachable_states(self.symbolic).diagram
 
     def flat(self, root: SolvedTask) -> tuple[Evaluation | None, str]:
         """The optimum over all primitive actions, or why it was left out."""
@@ -295,18 +333,12 @@ class _Planner:
         names = tuple(action.name for action in self.symbolic.actions)
         task = root.task
         flat_already = len(self.solved) == 1 and task.actions == names and not task.has_pseudo_reward
-        if flat_already:
+        if flat_already and self.merging is None:
             return evaluate(root.reduction, root.solution), "the plan is flat"
-        reachable = None
-        if self.options.reachable:
-            from factored_polca.symbolic.reach import reachable_states
-
-            reachable = reachable_states(self.symbolic).diagram
         try:
-            process = flat_process(
-                self.symbolic, reachable=reachable, terminal=root.reduction.process.terminal
+            process = seen_flat_process(
+                self.symbolic, root.reduction.process.terminal, self.flat_reachable()
             )
-            process = replace(process, channels=None)
             reduction = self.reduce("flat optimum", process, limit)
             solution = self.optimise("flat optimum", reduction, "auto")
         except LimitReached as error:

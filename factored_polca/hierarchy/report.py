@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from factored_polca.hierarchy.irrelevance import KINDS, value_classes
+from factored_polca.hierarchy.merging import approximation_report, merging_report, merging_text
 from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.minimisation.reduction import InterchangeableReduction
@@ -22,6 +23,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
         "flat_blocks": None if plan.flat is None else plan.flat.blocks,
         "flat_note": plan.flat_note,
         "guarantee": guarantee(plan),
+        **merging_report(plan.root.approximation, plan.certified),
         "tasks": [
             {
                 "name": solved.task.name,
@@ -39,6 +41,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "dead_end_states": solved.dead_end_states,
                 "collision_bound": solved.reduction.minimisation.collision_bound,
                 "seconds": solved.seconds,
+                **approximation_report(solved.approximation),
             }
             for solved in plan.solved
         ],
@@ -65,6 +68,8 @@ def guarantee(plan: HierarchicalPlan) -> str:
     width = plan.polled.upper - plan.polled.lower
     gap = max(solved.solution.gap for solved in plan.solved)
     chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
+    if plan.root.approximation is not None:
+        return merging_text(plan.root.approximation, plan.certified)
     return (
         f"recursively optimal (each task given its children's policies, solver gaps up to {gap:.1g}); the "
         f"policy's value lies in bounds {width:.1g} wide; each partition exact but for a chance "
