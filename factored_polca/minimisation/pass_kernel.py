@@ -9,14 +9,20 @@ so a pass regresses D, which is sparse, and splits by that (`factored_polca.mini
 Where nothing of a block is untouched the largest of its parts keeps its element, so that D holds the
 smaller ones (Hopcroft 1971; Paige & Tarjan 1987).
 
-For each choice c, with masks m_cp, the 0/1 diagrams of where c applies and stands for primitive p,
+For each choice c, with masks m_cp, the 0/1 diagrams of where c applies and stands for primitive p, and
+with a random factor s_c,
 
-    f_c = sum over p of m_cp R_p[D];     split by f_c.
+    f_c = sum over p of m_cp R_p[D];     split by sum over c of s_c f_c.
+
+The sum is one random linear form of all rows of a state: where some f_c differ it agrees with a chance of
+1/p over s (Schwartz 1980), and one split does for all choices.
 
 Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them.
 
-    progress  [choice, stage, place in the choice's list of primitives; in stage 3 the node of f_c]
-    counts    [nodes of D]
+    progress    [choice, stage, place in the choice's list of primitives; in stage 4 what to split by]
+    counts      [nodes of D]
+    signatures  f_c [choice], of the choices done in this pass
+    factors     the leaf s_c [choice]
 """
 
 from __future__ import annotations
@@ -24,7 +30,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import int64, lean_kernel
+from factored_polca.diagrams.jit import inline, int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, Int32Array, Int64Array
 from factored_polca.diagrams.weighted import (
     NORMALISED,
@@ -55,6 +61,18 @@ CHOICE, STEP, PLACE = range(3)
 """Places in `progress`."""
 
 
+@inline
+def begin_sum(stack: Int32Array, sum_state: Int64Array, count: int, normalised: int) -> None:
+    """The frame of a weighted sum of `count` terms, as `run_weighted_sum` takes it."""
+    stack[0] = 0
+    stack[1] = count
+    stack[2] = -1
+    stack[3] = 0
+    stack[4] = normalised
+    sum_state[0] = 1
+    sum_state[1] = 0
+
+
 @lean_kernel
 def run_passes(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
@@ -68,7 +86,7 @@ def run_passes(
     nodes: Int32Array, images: Int32Array, new_blocks: Int32Array, exact: UInt64Array,
     changes: UInt64Array, rough: npt.NDArray[np.float64], changed: Int32Array, counts: Int64Array,
     sum_state: Int64Array, walked: Int64Array, state: Int64Array, work: Int64Array,
-    progress: Int64Array, collect_at: int, passes: int,
+    progress: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
 ) -> int:  # fmt: skip
     """Passes over all choices until D is 0, or `passes` are done (counted in `numbers`).
 
@@ -126,22 +144,14 @@ def run_passes(
                         terms[2 * count] = choice_mask[j]
                         terms[2 * count + 1] = part
                         count += 1
+                begin_sum(stack, sum_state, count, plain[NORMALISED])
+                progress[STEP] = 2
                 if count == 0:
-                    progress[CHOICE] += 1
-                    progress[STEP] = 0
-                    continue
-                if count == 1 and terms[0] == plain[ONE]:
-                    progress[PLACE] = terms[1]
+                    signatures[c] = zero
                     progress[STEP] = 3
-                else:
-                    stack[0] = 0
-                    stack[1] = count
-                    stack[2] = -1
-                    stack[3] = 0
-                    stack[4] = plain[NORMALISED]
-                    sum_state[0] = 1
-                    sum_state[1] = 0
-                    progress[STEP] = 2
+                elif count == 1 and terms[0] == plain[ONE]:
+                    signatures[c] = terms[1]
+                    progress[STEP] = 3
             if progress[STEP] == 2:
                 code = run_weighted_sum(
                     pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
@@ -151,25 +161,48 @@ def run_passes(
                     return code
                 head[2] += STEPS - sum_state[2]
                 sum_state[2] = STEPS
-                progress[PLACE] = results[0]
+                signatures[c] = results[0]
+            progress[CHOICE] += 1
+            progress[STEP] = 0
+            if progress[CHOICE] == choices:
+                count = int64(0)
+                for j in range(choices):
+                    if signatures[j] != zero:
+                        terms[2 * count] = factors[j]
+                        terms[2 * count + 1] = signatures[j]
+                        count += 1
+                begin_sum(stack, sum_state, count, plain[NORMALISED])
                 progress[STEP] = 3
-            code = run_split(
-                pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
-                field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
-                nodes, images, new_blocks, exact, changes, rough, state, work,
+                if count < 2:
+                    progress[PLACE] = terms[1] if count == 1 else zero
+                    progress[STEP] = 4
+        if progress[STEP] == 3:
+            code = run_weighted_sum(
+                pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
+                results, sum_state,
             )  # fmt: skip
             if code != DONE:
                 return code
-            progress[CHOICE] += 1
-            progress[STEP] = 0
-            if numbers[BLOCKS] > numbers[ALLOWED]:
-                return BEYOND
+            head[2] += STEPS - sum_state[2]
+            sum_state[2] = STEPS
+            progress[PLACE] = results[0]
+            progress[STEP] = 4
+        code = run_split(
+            pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
+            field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
+            nodes, images, new_blocks, exact, changes, rough, state, work,
+        )  # fmt: skip
+        if code != DONE:
+            return code
         live[DIFFERENCE] = live[NEXT]
         live[NEXT] = zero
         for p in range(len(regressed)):
             regressed[p] = 0
         progress[CHOICE] = 0
+        progress[STEP] = 0
         numbers[PASSES] += 1
+        if numbers[BLOCKS] > numbers[ALLOWED]:
+            return BEYOND
         if head[2] - numbers[LOOKED] > STEPS // 8:
             numbers[LOOKED] = head[2]
             return PAUSE

@@ -94,12 +94,20 @@ class Propagation:
         inverses = [field.encode(pow(size, -1, field.prime)) for size in sizes]
         self.inverses = np.array([*inverses, field.encode(1)], dtype=np.uint64)
         self.unit = np.uint64(field.encode(1))
+        self.factors = [self._constant(factor) for factor in draw(len(self.choices))]
+        self.signatures = np.zeros(len(self.choices), dtype=np.int32)
+        self.signature_handles: list[Diagram] = []
         self._list_choices()
         self._prepare_primitives()
         self._size_arrays(elements)
         self.collections = -1
         self._refresh()
         self._measure(labels)
+
+    def _constant(self, stored: np.uint64) -> Diagram:
+        """The leaf of an element in stored form."""
+        node = self.manager.leaf_nodes(np.array([stored], dtype=np.uint64))[0]
+        return self.manager.handle(int(node), self.field)
 
     # -- what the kernel is given ------------------------------------------------------------------
 
@@ -149,7 +157,7 @@ class Propagation:
         self.largest = np.zeros(blocks, dtype=np.int32)
         self.fresh = self.draw(1024)
         levels, manager = self.manager.leaf_level + 3, self.manager
-        widest = max((*manager.sizes, 2, int(np.diff(self.choice_first).max(initial=1))))
+        widest = max((*manager.sizes, 2, int(np.diff(self.choice_first).max(initial=1)), len(self.choices)))
         self.terms = np.zeros(2 * widest * levels + 2, dtype=np.int32)
         self._size_node_arrays()
 
@@ -195,6 +203,9 @@ class Propagation:
         self.live[:] = [handle.node for handle in self.handles]
         self.weight_nodes = np.array([0, *(w.node for w in self.weights)], dtype=np.int32)[1:]
         self.mask_nodes = np.array([mask.node for mask in self.masks], dtype=np.int32)
+        self.factor_nodes = np.array([factor.node for factor in self.factors], dtype=np.int32)
+        for number, handle in enumerate(self.signature_handles):
+            self.signatures[number] = handle.node
         for number, handle in self.regressed_handles.items():
             self.regressed[number] = handle.node
         self.collections = manager.collections
@@ -211,6 +222,9 @@ class Propagation:
             int(number): manager.handle(int(self.regressed[number]), self.field)
             for number in np.flatnonzero(self.regressed)
         }
+        self.signature_handles = [
+            manager.handle(int(node), self.field) for node in self.signatures[: self.progress[0]]
+        ]
 
     def _measure(self, labels: Diagram) -> None:
         """The share of each block."""
@@ -308,7 +322,7 @@ class Propagation:
                 self.regressed, self.live, self.numbers, self.elements, self.block_shares, self.touched,
                 self.largest, self.fresh, self.nodes, self.images, self.new_blocks, self.exact,
                 self.changes, self.rough, self.changed, self.counts, self.sum_state, self.walked,
-                self.state, self.work, self.progress, m.collect_at, end,
+                self.state, self.work, self.progress, self.signatures, self.factor_nodes, m.collect_at, end,
             )  # fmt: skip
             if code == DONE:
                 return

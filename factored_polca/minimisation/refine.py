@@ -21,7 +21,7 @@ the cleared numerator of their difference has B bits, at most B/60 of the 2.7 * 
 states in one block with different rows, rewards or masks that is fixed before the confirming draws,
 and passes with probability at most
 
-    B/60 / 2.7 * 10^16 + (2 + J) / 2^60,   J observation channels,
+    B/60 / 2.7 * 10^16 + (3 + J) / 2^60,   J observation channels,
 
 which is reported, raised to the number of confirming rounds that passed in a row, times the number of
 rounds that might have been the last.
@@ -398,7 +398,7 @@ class _Refinement:
 
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
-        degree = 2 + len(self.process.channels or ())
+        degree = 3 + len(self.process.channels or ())
         bits = difference_bits(self.process)
         if self.interchangeable:  # a product over the choices
             degree, bits = degree * len(self.process.choices), bits * len(self.process.choices)
