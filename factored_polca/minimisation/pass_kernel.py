@@ -17,7 +17,8 @@ with a random factor s_c,
 The sum is one random linear form of all rows of a state: where some f_c differ it agrees with a chance of
 1/p over s (Schwartz 1980), and one split does for all choices.
 
-Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them.
+Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them, or,
+where `width[p]` is not 0, the row p of those that `run_descent` takes.
 
     progress    [choice, stage, place in the choice's list of primitives; in stage 4 what to split by]
     counts      [nodes of D]
@@ -30,12 +31,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import inline, int64, lean_kernel
+from factored_polca.diagrams.descent import FOUND, FRAMES, HEADER, SUMMING, run_descent
+from factored_polca.diagrams.jit import int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, Int32Array, Int64Array
 from factored_polca.diagrams.weighted import (
     NORMALISED,
     ONE,
     ZERO,
+    begin_sum,
     collect_possible,
     run_regression,
     run_weighted_sum,
@@ -61,18 +64,6 @@ CHOICE, STEP, PLACE = range(3)
 """Places in `progress`."""
 
 
-@inline
-def begin_sum(stack: Int32Array, sum_state: Int64Array, count: int, normalised: int) -> None:
-    """The frame of a weighted sum of `count` terms, as `run_weighted_sum` takes it."""
-    stack[0] = 0
-    stack[1] = count
-    stack[2] = -1
-    stack[3] = 0
-    stack[4] = normalised
-    sum_state[0] = 1
-    sum_state[1] = 0
-
-
 @lean_kernel
 def run_passes(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
@@ -86,7 +77,11 @@ def run_passes(
     nodes: Int32Array, images: Int32Array, new_blocks: Int32Array, exact: UInt64Array,
     changes: UInt64Array, rough: npt.NDArray[np.float64], changed: Int32Array, counts: Int64Array,
     sum_state: Int64Array, walked: Int64Array, state: Int64Array, work: Int64Array,
-    progress: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
+    progress: Int64Array, width: Int64Array, carried: npt.NDArray[np.int64],
+    row_roots: npt.NDArray[np.int32], row_identity: npt.NDArray[np.int32],
+    row_fixed: npt.NDArray[np.int32], row_base: npt.NDArray[np.int64], row_last: Int64Array,
+    entry_first: Int64Array, entry_value: Int32Array, entry_weight: Int32Array, entry_weights: Int32Array,
+    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
 ) -> int:  # fmt: skip
     """Passes over all choices until D is 0, or `passes` are done (counted in `numbers`).
 
@@ -114,6 +109,27 @@ def run_passes(
                         value = int64(live[DIFFERENCE])
                         if last_changed[p] < 0 or pool[value] == leaf_level:
                             regressed[p] = value
+                        elif width[p] >= 0:
+                            if down[FRAMES] == 0:
+                                frames[0] = 0
+                                frames[1] = 0
+                                frames[2] = -1
+                                frames[HEADER] = value
+                                for j in range(width[p]):
+                                    frames[HEADER + 1 + j] = row_roots[p, j]
+                                down[FRAMES] = 1
+                                down[FOUND] = 0
+                                down[SUMMING] = 0
+                            code = run_descent(
+                                pool, head, unique, arity, slots, ring, ring_state, sums, field, stack,
+                                terms, results, sum_state, keys[p], width[p], carried[p],
+                                row_identity[p], row_fixed[p], row_base[p], row_last[p], entry_first,
+                                entry_value, entry_weight, entry_weights, frames, found, down,
+                            )  # fmt: skip
+                            if code != DONE:
+                                return code
+                            regressed[p] = found[0]
+                            down[FRAMES] = 0
                         else:
                             if walked[0] == 0 and walked[1] == 0:
                                 if len(changed) <= head[1]:

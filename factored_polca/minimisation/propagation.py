@@ -37,6 +37,7 @@ from factored_polca.minimisation.split_kernel import (
     USED,
     shares,
 )
+from factored_polca.symbolic.descent import Cuts, Descents
 from factored_polca.symbolic.regression import Prepared
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -62,6 +63,7 @@ class Propagation:
         allowed: stop beyond so many blocks.
         look: called now and then with the passes so far and the blocks.
         race: tells how to regress all of V, in the first pass.
+        cuts: keeps the cuts of rows from one field to the next.
     """
 
     def __init__(
@@ -74,11 +76,13 @@ class Propagation:
         allowed: int | None = None,
         look: Callable[[int, int], None] | None = None,
         race: Race | None = None,
+        cuts: Cuts | None = None,
     ) -> None:
         field = view.numbers.leaf_type
         assert isinstance(field, Field)
         self.view, self.field, self.draw, self.look = view, field, draw, look
         self.manager, self.race = view.numbers.manager, race
+        self.cuts: Cuts = {} if cuts is None else cuts
         self.zero, self.one = view.numbers.zero, view.numbers.one
         self.choices: Sequence[Choice] = view.process.choices
         self.numbers = np.array([len(elements), 0, 0, allowed or UNLIMITED, 0], dtype=np.int64)
@@ -144,6 +148,8 @@ class Propagation:
                 self.last_changed[number] = prepared.last_changed
                 self.keys[number] = prepared.key
                 self.weights += prepared.handles
+        inside = [-1 if number in self.others else p for number, p in enumerate(self.primitives)]
+        self.descents = Descents(numbers, inside, self.cuts)
         self.regressed = np.zeros(len(self.primitives), dtype=np.int32)
         self.regressed_handles: dict[int, Diagram] = {}
 
@@ -204,6 +210,7 @@ class Propagation:
         self.weight_nodes = np.array([0, *(w.node for w in self.weights)], dtype=np.int32)[1:]
         self.mask_nodes = np.array([mask.node for mask in self.masks], dtype=np.int32)
         self.factor_nodes = np.array([factor.node for factor in self.factors], dtype=np.int32)
+        self.descents.refresh()
         for number, handle in enumerate(self.signature_handles):
             self.signatures[number] = handle.node
         for number, handle in self.regressed_handles.items():
@@ -312,7 +319,7 @@ class Propagation:
 
     def _run_until(self, end: int) -> None:
         """The kernel, until `end` passes are done or nothing changes any more."""
-        m = self.manager
+        m, d = self.manager, self.descents
         while True:
             code = run_passes(
                 m.pool, m.head, m.unique, m.arity, m.cache, m.slots, m.ring, m.ring_state, m.stack,
@@ -322,7 +329,9 @@ class Propagation:
                 self.regressed, self.live, self.numbers, self.elements, self.block_shares, self.touched,
                 self.largest, self.fresh, self.nodes, self.images, self.new_blocks, self.exact,
                 self.changes, self.rough, self.changed, self.counts, self.sum_state, self.walked,
-                self.state, self.work, self.progress, self.signatures, self.factor_nodes, m.collect_at, end,
+                self.state, self.work, self.progress, d.width, d.carried, d.roots, d.identity, d.fixed,
+                d.base, d.last, d.first, d.value, d.weight, d.weight_nodes, d.frames, d.found, d.down,
+                self.signatures, self.factor_nodes, m.collect_at, end,
             )  # fmt: skip
             if code == DONE:
                 return

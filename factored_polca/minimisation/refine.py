@@ -75,6 +75,7 @@ from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagatio
 from factored_polca.minimisation.race import Race
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
+from factored_polca.symbolic.descent import Cuts
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
 
 PRIMES_IN_RANGE = 2.7e16
@@ -187,6 +188,7 @@ class _Refinement:
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | None = None
         self.race = Race()
+        self.cuts: Cuts = {}
         self.denominator = common_denominator(process)
         self.use(Field() if self.denominator % MERSENNE_61 else Field(self.fresh_prime()))
 
@@ -331,6 +333,7 @@ class _Refinement:
             lambda count: self.field.draw(self.generator, count),
             allowed=None if self.block_limit is None else self.block_limit + outside,
             look=lambda passes, blocks: self.report(self.rounds + passes, blocks), race=self.race,
+            cuts=self.cuts,
         )  # fmt: skip
 
     def keep(self, propagation: Propagation) -> None:
