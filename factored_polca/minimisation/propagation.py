@@ -98,7 +98,9 @@ class Propagation:
         inverses = [field.encode(pow(size, -1, field.prime)) for size in sizes]
         self.inverses = np.array([*inverses, field.encode(1)], dtype=np.uint64)
         self.unit = np.uint64(field.encode(1))
-        self.factors = [self._constant(factor) for factor in draw(len(self.choices))]
+        self.factors = [
+            self.manager.stored_constant(f, self.field) for f in draw(len(self.choices)).tolist()
+        ]
         self.signatures = np.zeros(len(self.choices), dtype=np.int32)
         self.signature_handles: list[Diagram] = []
         self._list_choices()
@@ -107,11 +109,6 @@ class Propagation:
         self.collections = -1
         self._refresh()
         self._measure(labels)
-
-    def _constant(self, stored: np.uint64) -> Diagram:
-        """The leaf of an element in stored form."""
-        node = self.manager.leaf_nodes(np.array([stored], dtype=np.uint64))[0]
-        return self.manager.handle(int(node), self.field)
 
     # -- what the kernel is given ------------------------------------------------------------------
 
@@ -137,19 +134,22 @@ class Propagation:
         self.last_changed = np.full(len(self.primitives), -1, dtype=np.int64)
         self.keys = np.zeros(len(self.primitives), dtype=np.int64)
         self.weights: list[Diagram] = []
-        self.others: list[int] = []
-        for number, primitive in enumerate(self.primitives):
-            compiled = numbers.symbolic.actions[primitive]
-            if sensed is not None or compiled.synchronic:
-                self.others.append(number)
-            elif compiled.rows:
-                prepared: Prepared = numbers.prepared(primitive)
-                self.first_weights[number] = prepared.first + len(self.weights)
-                self.last_changed[number] = prepared.last_changed
-                self.keys[number] = prepared.key
-                self.weights += prepared.handles
-        inside = [-1 if number in self.others else p for number, p in enumerate(self.primitives)]
+        actions = [numbers.symbolic.actions[primitive] for primitive in self.primitives]
+        self.others = [n for n, a in enumerate(actions) if sensed is not None or a.synchronic]
+        inside = [-1 if n in self.others else primitive for n, primitive in enumerate(self.primitives)]
         self.descents = Descents(numbers, inside, self.cuts)
+        for number, (primitive, compiled) in enumerate(zip(self.primitives, actions, strict=True)):
+            if number in self.others or not compiled.rows:
+                continue
+            if self.descents.few[number]:
+                self.last_changed[number] = max(map(numbers.symbolic.now, compiled.rows))
+                self.keys[number] = numbers.regression_key(primitive)
+                continue
+            prepared: Prepared = numbers.prepared(primitive)
+            self.first_weights[number] = prepared.first + len(self.weights)
+            self.last_changed[number] = prepared.last_changed
+            self.keys[number] = prepared.key
+            self.weights += prepared.handles
         self.regressed = np.zeros(len(self.primitives), dtype=np.int32)
         self.regressed_handles: dict[int, Diagram] = {}
 
@@ -315,7 +315,8 @@ class Propagation:
             return []
         if node_count(self.handles[DIFFERENCE]) < LARGE:
             return []
-        return [n for n in range(len(self.primitives)) if self.last_changed[n] >= 0]
+        few = self.descents.few
+        return [n for n in range(len(self.primitives)) if self.last_changed[n] >= 0 and not few[n]]
 
     def _run_until(self, end: int) -> None:
         """The kernel, until `end` passes are done or nothing changes any more."""

@@ -3,10 +3,10 @@
 Letters: P partition (state -> block), r_k random field element of block k, V = r o P, f_c = R_c[V]
 regression through choice c, masked.
 
-    0. P_0 separates states by terminal flag, applicable choices and rewards.
+    0. P_0 separates states by terminal flag, applicable choices and a random linear form of the rewards.
     1. one pass: for each choice c, V = r o P, f_c = R_c[V]; P becomes the distinct pairs (P, f_c).
     2. a pass without a split ends the refinement;
-    3. a confirming pass repeats 0 and 1 with fresh draws and another, random, prime; a split there
+    3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a split there
        sends the refinement on with that prime.
 
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
@@ -58,6 +58,7 @@ from factored_polca.diagrams import (
     pairs,
     random_prime,
     relabel,
+    weighted_sum,
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.drawn import Drawn, Framed
@@ -227,7 +228,7 @@ class _Refinement:
         while passed < confirmations:
             self.use(Field(self.fresh_prime()))
             before = self.labels.blocks
-            self.begin()
+            self.split_rewards()  # the rest of the beginning knows no numbers
             self.attempts += 1
             if self.one_pass() or self.labels.blocks > before:
                 passed = 0
@@ -257,13 +258,24 @@ class _Refinement:
             self.split(
                 diagram if reachable is None else choose(reachable, diagram, self.manager.constant(0))
             )
+        if not self.interchangeable:
+            for choice in self.process.choices:
+                self.split(self.view.app(choice))
+        self.split_rewards()
+
+    def split_rewards(self) -> None:
+        """Separate by rewards: by a random linear form of those of all choices, or by their multiset."""
         if self.interchangeable:
             self.split(self.polynomial.of_rewards())
             return
-        for choice in self.process.choices:
-            self.split(self.view.app(choice))
-        for choice in self.process.choices:
-            self.split(self.view.reward(choice))
+        rewards = [self.view.reward(choice) for choice in self.process.choices]
+        distinct = list(
+            {reward.node: reward for reward in rewards if reward != self.view.numbers.zero}.values()
+        )
+        factors = self.field.draw(self.generator, len(distinct))
+        if distinct:
+            weights = [self.manager.stored_constant(factor, self.field) for factor in factors.tolist()]
+            self.split(weighted_sum(weights, distinct))
 
     def split_seen(self) -> None:
         """Separate by the observed features: what is seen at every step, the end included."""

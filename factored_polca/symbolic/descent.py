@@ -89,7 +89,7 @@ class Descents:
     """Arrays over the primitive actions `actions`, in their order (-1: none); nodes are of the last `refresh`.
 
     `known` keeps the cuts from one field to the next.  `width[p]` is the number of carried features, -1
-    where an action is not suited; `carried`, `roots` and `identity` are [p, carried feature],
+    where an action is not suited, `few[p]` whether it is and changes few features; `carried`, `roots` and `identity` are [p, carried feature],
     `fixed` and `base` [p, level].
     """
 
@@ -103,6 +103,7 @@ class Descents:
         self.bases: dict[int, int] = {}
         self.cuts = [self._cuts(action) for action in actions]
         self.width = np.array([sum(c.carried for c, _ in cuts) if cuts else -1 for cuts in self.cuts])
+        self.few = [0 < len(cuts) <= CARRIED for cuts in self.cuts]
         shape = (len(actions), int(self.width.max(initial=0)))
         self.carried = np.zeros(shape, dtype=np.int64)
         self.roots = np.zeros(shape, dtype=np.int32)
