@@ -17,9 +17,10 @@ from fractions import Fraction
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import Diagram
-from factored_polca.diagrams.descent import stride
-from factored_polca.diagrams.operations import Walk, node
+from factored_polca.diagrams import Diagram, Field
+from factored_polca.diagrams.descent import HEADER, run_descent, stride
+from factored_polca.diagrams.nodes import STEPS
+from factored_polca.diagrams.operations import Walk, node, sum_options
 from factored_polca.symbolic.regression import NumericView
 from factored_polca.symbolic.rows import RowDiagram
 
@@ -94,7 +95,7 @@ class Descents:
     """
 
     def __init__(self, numbers: NumericView, actions: Sequence[int], known: Cuts) -> None:
-        self.numbers, self.manager = numbers, numbers.manager
+        self.numbers, self.manager, self.actions = numbers, numbers.manager, tuple(actions)
         self.first_entries: list[int] = [0]
         self.values: list[int] = []
         self.numbers_of_weights: list[int] = []
@@ -141,6 +142,36 @@ class Descents:
             for c, _ in cuts:
                 if not c.carried:
                     self.fixed[p, c.level] = c.diagram.node
+
+    def regress(self, place: int, value: Diagram) -> Diagram:
+        """The regression of a function of the features through the suited action at a place of `actions`."""
+        manager, numbers = self.manager, self.numbers
+        assert isinstance(numbers.leaf_type, Field) and self.width[place] >= 0
+        manager.safe_point()
+        self.refresh()
+        self.begin(place, value.node)
+        options, parameters = sum_options(manager, numbers.leaf_type, True), numbers.leaf_type.parameters
+        key = numbers.regression_key(self.actions[place])
+        sums = np.array([0, 0, STEPS], dtype=np.int64)
+
+        def step() -> int:
+            m = manager
+            return run_descent(
+                m.pool, m.head, m.unique, m.arity, m.slots, m.ring, m.ring_state, options, parameters,
+                m.stack, m.terms, m.results, sums, key, int(self.width[place]), self.carried[place],
+                self.identity[place], self.fixed[place], self.base[place], int(self.last[place]),
+                self.first, self.value, self.weight, self.weight_nodes, self.frames, self.found, self.down,
+            )  # fmt: skip
+
+        manager.run(step)
+        return manager.handle(int(self.found[0]), numbers.leaf_type)
+
+    def begin(self, place: int, node: int) -> None:
+        """The frame with which the kernel begins."""
+        self.frames[:HEADER] = 0, 0, -1
+        self.frames[HEADER] = node
+        self.frames[HEADER + 1 : HEADER + 1 + self.width[place]] = self.roots[place, : self.width[place]]
+        self.down[:] = 1, 0, 0
 
     def _cuts(self, action: int) -> list[tuple[Cut, int]]:
         """The changed features of an action, from the top, each with the number of its row 0."""
