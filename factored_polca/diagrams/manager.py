@@ -147,8 +147,11 @@ class Manager:
 
     def constant(self, value: int | float, leaf_type: LeafType = INDEX) -> Diagram:
         """The diagram that is `value` everywhere; for a field an integer mod p."""
-        payload = leaf_type.encode(value)  # type: ignore[arg-type]
-        return self.handle(int(self.leaf_nodes(np.array([payload], dtype=np.uint64))[0]), leaf_type)
+        return self.stored_constant(leaf_type.encode(value), leaf_type)  # type: ignore[arg-type]
+
+    def stored_constant(self, stored: int, leaf_type: LeafType) -> Diagram:
+        """The diagram that has everywhere the leaf whose payload is `stored`."""
+        return self.handle(int(self.leaf_nodes(np.array([stored], dtype=np.uint64))[0]), leaf_type)
 
     def variable(self, level: int, children: Sequence[Diagram]) -> Diagram:
         """The diagram that is `children[v]` where the variable at `level` has its value v.

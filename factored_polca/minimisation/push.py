@@ -253,7 +253,8 @@ def push_floats(
         if leaf[q] > largest:
             largest = leaf[q]
     total = np.zeros(largest + 1, np.float64)
-    touched = np.empty(largest + 1, np.int64)
+    touched = np.empty(largest + 1, np.int32)
+    leaves = np.empty(largest + 2, np.int32)
     pause_at = state[1] + PAIRS
     while state[0] < len(chosen):
         if state[1] >= pause_at:
@@ -291,11 +292,14 @@ def push_floats(
             for j in range(ends):
                 total[touched[j]] = 0.0
             return 1
-        ordered = np.sort(touched[:ends])
         for j in range(ends):
-            blocks[state[1] + j] = ordered[j]
-            masses[state[1] + j] = total[ordered[j]]
-            total[ordered[j]] = 0.0
+            size = _heap_push(leaves, size, touched[j])
+        for j in range(ends):
+            k = leaves[0]
+            size = _heap_pop(leaves, size)
+            blocks[state[1] + j] = k
+            masses[state[1] + j] = total[k]
+            total[k] = 0.0
         state[1] += ends
         row_ends[row] = state[1]
         state[0] += 1
