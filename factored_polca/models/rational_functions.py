@@ -186,10 +186,13 @@ class RationalFunction(Fraction):
         return sympy.factor(self._element.as_expr())
 
     def __str__(self) -> str:
-        top = polynomial_text(self.field.names, self.over)
-        if self.under == _one(len(self.field.names)):
+        over, under = self.over, self.under
+        if under[0][1] < 0:  # the sign of the term that is written first
+            over, under = _negative(over), _negative(under)
+        top = polynomial_text(self.field.names, over)
+        if under == _one(len(self.field.names)):
             return top
-        bottom = polynomial_text(self.field.names, self.under)
+        bottom = polynomial_text(self.field.names, under)
         top = f"({top})" if len(self.over) > 1 else top
         return f"{top}/{bottom}" if bottom.isidentifier() or bottom.isdigit() else f"{top}/({bottom})"
 
@@ -315,6 +318,10 @@ def _polynomial(polynomial: Any) -> Polynomial:
 
 def _one(parameters: int) -> Polynomial:
     return (((0,) * parameters, 1),)
+
+
+def _negative(polynomial: Polynomial) -> Polynomial:
+    return tuple((exponents, -coefficient) for exponents, coefficient in polynomial)
 
 
 def _value(polynomial: Polynomial, point: Sequence[Fraction]) -> Fraction:

@@ -45,7 +45,23 @@ class Condition:
         return 0 <= value <= 1 if self.kind == "probability" else value != 0
 
     def __str__(self) -> str:
-        return f"0 <= {self.function} <= 1" if self.kind == "probability" else f"{self.function} != 0"
+        if self.kind == "probability":
+            return f"0 <= {self.function} <= 1"
+        positive = self.function.over[0][1] > 0
+        return f"{self.function if positive else -self.function} != 0"
+
+    def interval(self) -> tuple[str, Fraction, Fraction] | None:
+        """The parameter and its bounds, where that is all there is to it: of a linear function of one."""
+        function = self.function
+        names = function.parameters
+        if self.kind != "probability" or len(names) != 1 or function.degree > 1:
+            return None
+        if any(any(exponents) for exponents, _ in function.under):
+            return None
+        at_zero, at_one = (function.at(dict.fromkeys(function.field.names, Fraction(t))) for t in (0, 1))
+        slope = at_one - at_zero
+        ends = sorted(((0 - at_zero) / slope, (1 - at_zero) / slope))
+        return names[0], ends[0], ends[1]
 
     @property
     def key(self) -> object:
@@ -54,6 +70,21 @@ class Condition:
             return self.kind, self.function.over
         complement = 1 - self.function
         return self.kind, frozenset([self.function, complement])
+
+
+def region_text(conditions: Sequence[Condition]) -> list[str]:
+    """The admissible region for people: one interval for each parameter where that is all, and the rest."""
+    intervals: dict[str, tuple[Fraction, Fraction]] = {}
+    rest: list[str] = []
+    for condition in conditions:
+        found = condition.interval()
+        if found is None:
+            rest.append(str(condition))
+            continue
+        name, low, high = found
+        known = intervals.get(name, (low, high))
+        intervals[name] = max(low, known[0]), min(high, known[1])
+    return [f"{low} <= {name} <= {high}" for name, (low, high) in intervals.items()] + rest
 
 
 def conditions_of(process: DecisionProcess, field: FunctionField) -> tuple[Condition, ...]:

@@ -13,8 +13,8 @@ them with probability at most (d / 2^60)^2 (Schwartz 1980; Zippel 1979).
 *Accuracy.*  The registers of the model's own numbers come first.  Each is evaluated in floats together
 with a running error bound (Higham, "Accuracy and Stability of Numerical Algorithms", 2002, section 3.3):
 s(a + b) = s(a) + s(b), s(a b) = s(a) s(b).  Where s is more than `CANCELLED` times the value, it is
-evaluated anew in rationals and rounded once.  All other registers are sums and products of these, which at an
-admissible setting are probabilities: nothing is subtracted, so their relative error is some 1e-16
+evaluated anew in rationals and rounded once.  All other registers are sums and products of these, which at
+an admissible setting are probabilities: nothing is subtracted, so their relative error is some 1e-16
 times the number of factors and sums.
 """
 
@@ -24,6 +24,7 @@ import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -61,26 +62,36 @@ class Program:
     numbers_end: int
     float_constants: FloatArray
 
+    @cached_property
+    def places(self) -> Int64Array:
+        """The registers of `numbers`."""
+        return np.array([register for register, _ in self.numbers], dtype=np.int64)
+
     @property
     def registers(self) -> int:
         """Their number."""
         return len(self.operation)
 
     def run(self, values: Mapping[str, Fraction]) -> FloatArray:
-        """Every register as a float [register], at a setting where no denominator is 0."""
-        from factored_polca.parametric.program_kernel import run_program
+        """Every register as a float [register], at a setting of all parameters.
+
+        Raises:
+            ZeroDivisionError: a denominator is 0 there.
+        """
+        from factored_polca.parametric.program_kernel import run_masses, run_numbers
 
         setting = np.array([float(values[name]) for name in self.field.names])
-        result, sizes = np.empty(self.registers), np.empty(self.registers)
-        arrays = (self.operation, self.left, self.right, self.float_constants, setting, result, sizes)
-        run_program(*arrays, 0, self.numbers_end)
-        if self.numbers:
-            places = np.array([register for register, _ in self.numbers])
-            lost = ~(sizes[places] <= CANCELLED * np.abs(result[places]))  # NaN is lost, too
-            for index in np.flatnonzero(lost).tolist():
-                register, function = self.numbers[index]
-                result[register] = float(function.at(values))
-        run_program(*arrays, self.numbers_end, self.registers)
+        result, sizes = np.empty(self.registers), np.empty(self.numbers_end)
+        run_numbers(
+            self.operation, self.left, self.right, self.float_constants, setting, result, sizes,
+            self.numbers_end,
+        )  # fmt: skip
+        places = self.places
+        lost = ~(sizes[places] <= CANCELLED * np.abs(result[places]))  # NaN is lost, too
+        for index in np.flatnonzero(lost).tolist():
+            register, function = self.numbers[index]
+            result[register] = float(function.at(values))
+        run_masses(self.operation, self.left, self.right, result, self.numbers_end)
         return result
 
     def run_exactly(self, values: Mapping[str, Fraction], wanted: npt.NDArray[Any]) -> dict[int, Fraction]:
@@ -248,7 +259,7 @@ class ProgramBuilder:
         return result
 
     def finish_numbers(self) -> None:
-        """Say that all the model's numbers are in.
+        """Say that all the model's numbers are in: from now on only sums and products.
 
         Of their registers only the last ones, which are made accurate, may be used again.
         """

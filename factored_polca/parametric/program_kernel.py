@@ -13,12 +13,12 @@ Int8Array = npt.NDArray[np.int8]
 
 
 @lean_kernel
-def run_program(
+def run_numbers(
     operation: Int8Array, left: Int32Array, right: Int32Array, constants: FloatArray,
-    setting: FloatArray, values: FloatArray, sizes: FloatArray, first: int, last: int,
+    setting: FloatArray, values: FloatArray, sizes: FloatArray, count: int,
 ) -> None:  # fmt: skip
-    """Fill registers first, .., last - 1 of `values` and of `sizes`, their running error bounds in ulps."""
-    for k in range(first, last):
+    """Fill the first `count` registers of `values` and of `sizes`, their running error bounds."""
+    for k in range(count):
         code = operation[k]
         i = left[k]
         j = right[k]
@@ -37,3 +37,15 @@ def run_program(
         else:
             values[k] = values[i] / values[j]
             sizes[k] = (sizes[i] + abs(values[k]) * sizes[j]) / abs(values[j])
+
+
+@lean_kernel
+def run_masses(
+    operation: Int8Array, left: Int32Array, right: Int32Array, values: FloatArray, first: int
+) -> None:
+    """Fill the registers from `first` on, sums and products of registers before them."""
+    for k in range(first, len(operation)):
+        if operation[k] == 2:
+            values[k] = values[left[k]] + values[right[k]]
+        else:
+            values[k] = values[left[k]] * values[right[k]]

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,9 @@ from factored_polca.minimisation.push import Int32Array
 from factored_polca.models.model import rational
 from factored_polca.parametric.process import ParametricProcess, checked_setting
 from factored_polca.parametric.program import Program
+
+CLEAR: Final = 1e-9
+"""From how far a condition's function must be from 0 and 1 for floats to decide."""
 
 Setting = Mapping[str, Fraction | float | str]
 """Values of parameters; a text or a float means its decimal exactly."""
@@ -71,6 +74,8 @@ class ParametricQuotient:
     terminal: BoolArray  # [block]
     observed: IntArray  # [block] what is seen of it, from 0
     observations: tuple[tuple[str, ...], ...]  # [choice][o]
+    conditions: IntArray  # [condition of the process] the register of its function
+    bounded: BoolArray  # [condition] whether it is that of a probability
 
     @property
     def partition(self) -> Partition:
@@ -101,6 +106,31 @@ class ParametricQuotient:
         """
         return checked_setting(self.process, {name: rational(value) for name, value in values.items()})
 
+    def run(self, values: Setting) -> FloatArray:
+        """The value of every register of the program at a setting.
+
+        Raises:
+            ModelError: see `setting`.
+        """
+        given = {name: rational(value) for name, value in values.items()}
+        if given.keys() <= set(self.parameters):
+            setting = {**self.process.nominal, **given}
+            registers = self.run_if_clear(setting)
+            if registers is not None:
+                return registers
+        return self.program.run(self.setting(values))
+
+    def run_if_clear(self, setting: Mapping[str, Fraction]) -> FloatArray | None:
+        """The registers at a setting of all parameters, if floats show that it is admissible."""
+        try:
+            registers = self.program.run(setting)
+        except (ZeroDivisionError, OverflowError):
+            return None
+        tested = registers[self.conditions]
+        below = np.where(self.bounded, 1.0 - tested, 1.0)
+        clear = np.where(self.bounded, tested, np.abs(tested))
+        return registers if bool(((clear > CLEAR) & (below > CLEAR)).all()) else None
+
     def mdp(self, values: Setting) -> ArrayMDP:
         """The quotient at a setting of the parameters.
 
@@ -110,7 +140,7 @@ class ParametricQuotient:
         """
         if self.partial:
             raise TypeError("the process is partially observed; use pomdp(...)")
-        return self.mdp_of(self.program.run(self.setting(values)))
+        return self.mdp_of(self.run(values))
 
     def pomdp(self, values: Setting) -> ArrayPOMDP:
         """The quotient of a partially observed process at a setting of the parameters.
@@ -121,7 +151,7 @@ class ParametricQuotient:
         """
         if not self.partial:
             raise TypeError("the process is fully observed; use mdp(...)")
-        return self.pomdp_of(self.program.run(self.setting(values)))
+        return self.pomdp_of(self.run(values))
 
     def mdp_of(self, registers: FloatArray) -> ArrayMDP:
         """The quotient for the values of all registers."""
@@ -150,7 +180,7 @@ class ParametricQuotient:
 
     def initial_distribution(self, values: Setting) -> FloatArray:
         """b0 over blocks at a setting, [block]."""
-        return np.asarray(self.program.run(self.setting(values))[self.initial])
+        return np.asarray(self.run(values)[self.initial])
 
     def exact_row(self, choice: int, block: int, values: Setting) -> dict[tuple[int, int], Fraction]:
         """The exact probability of each (next block, observation) at a setting; zeros left out."""

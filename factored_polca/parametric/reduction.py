@@ -97,6 +97,7 @@ class _Build:
             prepare_choice(process, partition, choice, taken, builder)
             for choice, taken in zip(process.choices, primitive, strict=True)
         ]
+        conditions = [builder.number(condition.function) for condition in self.open.conditions]
         builder.finish_numbers()
         kernels: list[JointKernel] = []
         for choice, taken, ready in zip(process.choices, primitive, prepared, strict=True):
@@ -122,6 +123,8 @@ class _Build:
             terminal=terminal,
             observed=seen_of_blocks(symbolic, states),
             observations=tuple(kernel.labels for kernel in kernels),
+            conditions=np.array(conditions, dtype=np.int64),
+            bounded=np.array([c.kind == "probability" for c in self.open.conditions], dtype=np.bool_),
         )
 
     def refuse_partial(
