@@ -46,7 +46,9 @@ class _Maker:
 
     def mixed(self, lottery: Lottery) -> Expression:
         chances = [q for _, q in lottery.outcomes]
-        positive = [isinstance(q, Constant) and isinstance(q.value, Fraction) and q.value > 0 for q in chances]
+        positive = [
+            isinstance(q, Constant) and isinstance(q.value, Fraction) and q.value > 0 for q in chances
+        ]
         if sum(positive) < 2 or not all(isinstance(q, Constant) for q in chances):
             return lottery
         if self.random.random() < 0.35:

@@ -44,10 +44,10 @@ def sensitivity(arguments: argparse.Namespace, output: Output) -> int:
     report_warnings(source, output)
     partial = source.model.observability == "partial"
     compile_seconds = compile_kernels(output, arguments.solver if partial else None)
-    _, deadline = limits(arguments)
+    memory, deadline = limits(arguments)
     began = time.process_time()
     with source.located(), output.progress(f"minimising {source.name} with {', '.join(ranges)} as symbols"):
-        process = opened(source, tuple(ranges), arguments)
+        process = opened(source, tuple(ranges), arguments, memory, deadline)
         quotient = reduce_parametric(
             process,
             seed=arguments.seed,
@@ -136,14 +136,17 @@ def refuse_unsolvable(source: Source) -> None:
 
 
 def opened(
-    source: Source, names: tuple[str, ...] | None, arguments: argparse.Namespace
+    source: Source,
+    names: tuple[str, ...],
+    arguments: argparse.Namespace,
+    memory: int | None,
+    deadline: float | None,
 ) -> ParametricProcess:
     """The flat process of a model with parameters as symbols, as the arguments limit it."""
     from factored_polca.minimisation import flat_process
     from factored_polca.parametric import compile_parametric, parametric_process
     from factored_polca.symbolic.reach import reachable_states
 
-    memory, deadline = limits(arguments)
     symbolic = compile_parametric(
         source.model, names, order=arguments.order, memory_limit=memory, deadline=deadline
     )
