@@ -413,8 +413,8 @@ def test_what_a_domain_needs_as_a_number_is_refused() -> None:
     for name, parameter in (("nursebot", "perturbation"), ("rocksample", "half_distance")):
         with pytest.raises(ModelError, match=f"{parameter} can't stay a symbol"):
             library.load(name, keep=[parameter])
-    with pytest.raises(ModelError, match="size is 8: it must be|size"):
-        parametric_flat_process(library.load("linear", keep=["size"]).model)
+    with pytest.raises(ModelError, match=r"size is .*it must be an integer"):
+        library.load("linear", keep=["size"])
     with pytest.raises(ModelError, match="discount can't stay a symbol"):
         library.load("tiger", keep=["discount"])
     with pytest.raises(ModelError, match="no parameter 'acuracy'; did you mean 'accuracy'"):

@@ -137,7 +137,7 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     names = arguments.keep_parameters
     if names is not None and arguments.certify:
         raise UsageError("--certify checks rows of numbers, and --keep-parameters leaves symbols in them")
-    source = load(arguments.model, arguments.set, keep=names)
+    source = load(arguments.model, arguments.set, None, names)
     actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
     report_warnings(source, output)
     compile_seconds = compile_kernels(output)

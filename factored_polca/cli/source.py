@@ -41,7 +41,7 @@ class Source:
 
 
 def load(
-    text: str, settings: Sequence[str] = (), tasks: str | None = None, *, keep: Sequence[str] | None = None
+    text: str, settings: Sequence[str] = (), tasks: str | None = None, keep: Sequence[str] | None = None
 ) -> Source:
     """The model that MODEL names: a file, or else a shipped domain.
 
