@@ -29,6 +29,7 @@ def commands() -> dict[str, Callable[..., int]]:
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
         "figure": figure.figure, "bench": run_bench, "study": run_study, "compare": compare.compare,
+        "sensitivity": run_sensitivity,
     }  # fmt: skip
 
 
@@ -44,6 +45,13 @@ def run_study(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.cli.study import study as work
 
     return work(arguments, output)
+
+
+def run_sensitivity(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `sensitivity`."""
+    from factored_polca.cli.sensitivity import sensitivity
+
+    return sensitivity(arguments, output)
 
 
 def run_bench(arguments: argparse.Namespace, output: Output) -> int:

@@ -20,6 +20,7 @@ from factored_polca.cli.argument_types import (
 )
 from factored_polca.cli.bench_arguments import add_bench
 from factored_polca.cli.compare_arguments import add_comparing
+from factored_polca.cli.sensitivity_arguments import add_keeping, add_sensitivity
 from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
@@ -112,6 +113,7 @@ def parser() -> argparse.ArgumentParser:
     with_limits(sub)
     sub.add_argument("--actions", metavar="A,B,...", help="only these actions count")
     sub.add_argument("--certify", action="store_true", help="check the partition without fingerprints")
+    add_keeping(sub)
     sub.add_argument(
         "--interchangeable", action="store_true",
         help="actions count by what they do, not by name (where the state is seen)",
@@ -197,6 +199,10 @@ def parser() -> argparse.ArgumentParser:
     add_study(
         command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
     )
+    sub = command("sensitivity", "The optimal value as a function of parameters, from one minimisation.")
+    with_model(sub)
+    with_limits(sub)
+    add_sensitivity(sub)
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
     sub.add_argument("output", metavar="OUT")

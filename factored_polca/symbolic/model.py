@@ -15,7 +15,7 @@ undefined entries are replaced by harmless ones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -142,6 +142,7 @@ def compile_model(
     tasks: TaskHierarchy | None = None,
     memory_limit: int | None = None,
     deadline: float | None = None,
+    parameters: Mapping[str, Fraction] | None = None,
 ) -> SymbolicModel:
     """Compile `model`, checking its structure and its probabilities.
 
@@ -151,6 +152,7 @@ def compile_model(
         tasks: a hierarchy whose conditions the order shall serve too.
         memory_limit: bytes for the diagrams.
         deadline: `time.monotonic()` value at which to stop.
+        parameters: values of parameters in place of the model's, symbols among them.
 
     Raises:
         ModelError: with every fault found.
@@ -178,7 +180,9 @@ def compile_model(
     }
     levels |= {Reference(o.name): 2 * len(names) + i for i, o in enumerate(model.observations)}
     variables: list[Variable] = [*model.features, *model.observations]
-    compiler = ExpressionCompiler(manager, variables, levels, dict(model.parameters))
+    compiler = ExpressionCompiler(
+        manager, variables, levels, {**dict(model.parameters), **(parameters or {})}
+    )
     return _Build(model, names, tuple(position), manager, compiler).finish()
 
 
