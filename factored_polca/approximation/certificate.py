@@ -104,6 +104,11 @@ class Evidence:
         return (self.errors.rewards + np.where(self.errors.rows > 0, lost, 0.0))[:, self.classes.block]
 
     @property
+    def hides_dead_ends(self) -> bool:
+        """Whether rows may be wrong, and so where they lead."""
+        return self.errors is not None and bool(self.errors.rows.any())
+
+    @property
     def chosen(self) -> BoolArray:
         """What the policy allows [choice, class]."""
         numbers = np.arange(len(self.classes.rewards))[:, None]
@@ -214,13 +219,12 @@ def certificate_of(evidence: Evidence) -> Certificate:
         below, low_rewards = evidence.values(chosen, "lower", span)
         above, high_rewards = evidence.values(chosen, "upper", span)
         best, best_rewards = evidence.values(classes.applicable, "upper", span)
-        dead = evidence.errors is not None and not bool(np.isfinite(np.append(below, best)).all())
+        dead = evidence.hides_dead_ends and not bool(np.isfinite(np.append(below, best)).all())
         if dead or number == TIGHTENINGS - 1:
             break
-        span = min(span, float(np.append(best, 0.0).max() - np.append(below, 0.0).min()))
-    if dead:  # a row that is wrong may hide that it leads to a dead end
-        below = np.where(evidence.game.terminal, 0.0, -np.inf)
-    lower = at_start(evidence, low_rewards, chosen, below, "lower")
+        span = min(span, float(finite(best).max(initial=0.0) - finite(below).min(initial=0.0)))
+    # a row that is wrong may hide that it leads to a dead end
+    lower = -np.inf if dead else at_start(evidence, low_rewards, chosen, below, "lower")
     upper = at_start(evidence, high_rewards, chosen, above, "upper")
     optimum = max(at_start(evidence, best_rewards, classes.applicable, best, "upper"), lower)
     loss = np.inf

@@ -128,7 +128,7 @@ def extreme_values(
         values = _swept(game, rewards, q, values, kept)
     new, _ = backed(values)
     error = game.rounding(np.where(allowed, rewards, 0.0), np.where(kept, values, 0.0))
-    wrong = (new - values)[kept] if side == "upper" else (values - new)[kept]
+    wrong = new[kept] - values[kept] if side == "upper" else values[kept] - new[kept]
     shift = (max(float(wrong.max(initial=0.0)), 0.0) + error) / (1 - game.discount)
     shift += 2 * UNIT * float(np.abs(values[kept]).max(initial=0.0))
     result: FloatArray = np.where(kept, values + (shift if side == "upper" else -shift), values)

@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from itertools import count
 from typing import Any, TypeVar
 
 import numpy as np
@@ -38,6 +39,8 @@ from factored_polca.minimisation import DecisionProcess
 from factored_polca.models import Fault, ModelError
 from factored_polca.symbolic import RowDiagram, SymbolicAction, SymbolicModel, Term
 from factored_polca.symbolic.rows import Row
+
+_variants = count(1)
 
 Key = TypeVar("Key", bound=Hashable)
 Sets = tuple[Diagram, list[frozenset[Any]]]
@@ -123,7 +126,7 @@ def snap(symbolic: SymbolicModel, epsilon: Fraction | float | str) -> Snapped:
     work = _Snapping(symbolic, bound)
     actions = tuple(work.action(action) for action in symbolic.actions) if bound else symbolic.actions
     before, after = row_count(symbolic.actions), row_count(actions)
-    snapped = replace(symbolic, actions=actions) if bound else symbolic
+    snapped = replace(symbolic, actions=actions, variant=next(_variants)) if bound else symbolic
     return Snapped(symbolic, snapped, bound, work.changed, before, after, work.parents)
 
 
@@ -172,11 +175,11 @@ class _Snapping:
         dropped: dict[Key, Sets] = {}
         for key, row in diagrams.items():
             images = np.array([numbers.get(r, 0) for r in row.rows], dtype=np.uint64)
-            diagram, sets, count = drop_parents(
+            diagram, sets, dropped_here = drop_parents(
                 relabel(row.diagram, images, INDEX), lambda s: find.of(s) is not None
             )
             dropped[key] = (diagram, sets)
-            self.parents += count
+            self.parents += dropped_here
         shared = find.joined(s for _, sets in dropped.values() for s in sets)
         self.changed += sum(1 for s in shared for m in s if shared[s] != find.rows[m])
         return {key: self._rebuilt(diagrams[key], *dropped[key], shared) for key in diagrams}
@@ -220,7 +223,7 @@ def drop_parents(
     Returns:
         the diagram to numbers of sets, the sets, and how many levels went.
     """
-    count = 0
+    gone = 0
     current, sets = combine([diagram], lambda leaf: frozenset((leaf,)))
     for level in reversed(support(diagram)):
         if len(sets) == 1:
@@ -233,5 +236,5 @@ def drop_parents(
 
         without, joined = combine(parts, join)
         if all(fits(s) for s in joined):
-            current, sets, count = without, joined, count + 1
-    return current, sets, count
+            current, sets, gone = without, joined, gone + 1
+    return current, sets, gone

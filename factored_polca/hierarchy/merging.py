@@ -27,14 +27,14 @@ from factored_polca.approximation.approximate import (
     certify_pomdp,
 )
 from factored_polca.approximation.snap import Snapped, as_epsilon, snap
-from factored_polca.diagrams import Aborted, Diagram, MemoryLimit
+from factored_polca.diagrams import FLOAT, Aborted, Diagram, MemoryLimit, choose, leaves
 from factored_polca.hierarchy.options import Options
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
-from factored_polca.minimisation.criterion import policy_primitives
+from factored_polca.minimisation.criterion import ProcessView, policy_primitives
 from factored_polca.models import Fault, LimitReached, Model, ModelError
 from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
 from factored_polca.solvers.pomdp_result import POMDPSolution
-from factored_polca.symbolic import SymbolicModel
+from factored_polca.symbolic import NumericView, SymbolicModel
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,16 @@ class Merging:
             process, self.snapped, seed=options.seed, block_limit=block_limit, deadline=options.deadline,
             progress=progress, maximum_observations=options.maximum_observations,
         )  # fmt: skip
+
+    def has_purpose(self, process: DecisionProcess) -> bool:
+        """Whether a process, not merged yet, has several rewards; see `subtask.refuse_without_purpose`."""
+        view = ProcessView(process, NumericView(process.symbolic))
+        found: set[float] = set()
+        for choice in process.choices:
+            app, rewards = view.app(choice), view.reward(choice)
+            outside = rewards.manager.constant(np.inf, FLOAT)
+            found |= {float(value) for value in leaves(choose(app, rewards, outside))}
+        return len(found - {np.inf}) > 1
 
     def certify(
         self, reduction: Reduction, solution: MDPSolution, policy: Diagram, defined: Diagram

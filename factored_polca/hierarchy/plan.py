@@ -268,7 +268,8 @@ class _Planner:
         )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         reduction = self.merged(task.name, process)
-        refuse_without_purpose(task, reduction.mdp)
+        if self.merging is None or not self.merging.has_purpose(process):
+            refuse_without_purpose(task, reduction.mdp)
         solution = self.optimise(task.name, reduction, method, self.custom if task.solver is None else None)
         if isinstance(reduction, InterchangeableReduction):
             counts = count_exchanged(reduction.exchanged)

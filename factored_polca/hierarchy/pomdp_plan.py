@@ -232,7 +232,8 @@ class _Planner:
         process = subtask_process(self.symbolic, task, self.solved, self.reachable, channels)
         reduction = self.merged(task.name, process)
         quotient = reduction.pomdp_quotient
-        refuse_without_purpose(task, quotient.mdp)
+        if self.merging is None or not self.merging.has_purpose(process):
+            refuse_without_purpose(task, quotient.mdp)
         minimised = time.perf_counter()
         is_root = task in self.hierarchy.roots()
         solution = self.optimise(task, reduction, method, is_root)

@@ -78,7 +78,8 @@ class SymbolicModel:
     """A model compiled to diagrams of one manager; make it with `compile_model`.
 
     `initial` holds b0 as row diagrams over next variables: a feature's parents are other features
-    of the same, first, time slice.
+    of the same, first, time slice.  Models over one manager whose actions differ need a `variant` number
+    each: what the manager remembers of regressions it remembers by action and variant.
     """
 
     model: Model
@@ -90,6 +91,7 @@ class SymbolicModel:
     initial: dict[int, RowDiagram]
     warnings: tuple[Fault, ...] = ()
     positions: tuple[int, ...] = field(default=())  # [feature] -> position in the order
+    variant: int = 0
 
     def __repr__(self) -> str:
         return f"<SymbolicModel {self.model.name}: order {', '.join(self.order)}>"

@@ -165,7 +165,7 @@ class NumericView:
         if action not in self._prepared:
             features = range(len(self.symbolic.model.features))
             self._prepared[action] = self.prepare(
-                action, [self.weights(action, i) for i in features], action
+                action, [self.weights(action, i) for i in features], (action, self.symbolic.variant)
             )
         return self._prepared[action]
 
