@@ -18,6 +18,13 @@ from factored_polca.models.errors import LimitReached, ModelError
 if TYPE_CHECKING:
     from factored_polca.cli.output import Output
 
+WITH_PROCESSES = ("bench", "study")
+"""Commands that work in other processes than their own."""
+
+MEMORY_NOTED = ("check", "convert", "simulate", "run", "compare", "figure", *WITH_PROCESSES)
+"""Commands that say at their end how much memory they took: all that work more than a moment, but for
+those that have it in their table."""
+
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
@@ -95,13 +102,17 @@ def guarded(parsed: argparse.Namespace) -> int:
     What no one can mend but us is said too, with the status 1; with the variable
     FACTORED_POLCA_TRACEBACK set it comes with the traceback that a report of the fault needs.
     """
+    from factored_polca.cli.memory import memory_text
     from factored_polca.cli.output import Output
     from factored_polca.cli.source import UsageError
     from factored_polca.diagrams import Aborted, MemoryLimit
 
-    output = Output(parsed.json, parsed.quiet)
+    output = Output(parsed.json, parsed.quiet, children=parsed.command in WITH_PROCESSES)
     try:
-        return commands()[parsed.command](parsed, output)
+        status = commands()[parsed.command](parsed, output)
+        if parsed.command in MEMORY_NOTED and not parsed.json:
+            output.note(f"peak memory {memory_text(output.peak_memory_bytes())}")
+        return status
     except BrokenPipeError:
         raise
     except ModelError as error:

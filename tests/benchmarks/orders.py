@@ -129,9 +129,8 @@ def main() -> None:
     parser.add_argument("--shuffles", type=int, default=4, help="shuffled orders to start from")
     options = parser.parse_args()
     warm_up()
-    print(
-        "| case | blocks | orders | auto s | best s | auto | file | worst | auto's peak | best's peak | best |"
-    )
+    heads = "case", "blocks", "orders", "auto s", "best s", "auto", "file", "worst"
+    print("| " + " | ".join((*heads, "peak nodes of auto", "of the best", "best")) + " |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---|")
     for case in CASES:
         if options.words and not any(word in case for word in options.words):
