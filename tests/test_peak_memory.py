@@ -21,8 +21,8 @@ LINES = {
     "minimise": ["minimise", "toy"],
     "plan": ["plan", "toy"],
     "solve": ["solve", "toy"],
-    "act": ["act", "toy.polca", "--state", "A"],
-    "run": ["run", "toy.polca"],
+    "act": ["act", "toy.polca", "--state", "door=red"],
+    "run": ["run", "sightless.polca", "--auto", "--steps", "2"],
     "simulate": ["simulate", "toy.polca", "--episodes", "5"],
     "compare": ["compare", "toy.polca", "toy.polca", "--episodes", "5"],
     "figure": ["figure", "4a", "cheese_taxi", "--trials", "1"],
@@ -34,9 +34,12 @@ LINES = {
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Path:
-    """An empty folder but for a plan."""
+    """An empty folder but for two plans."""
     monkeypatch.chdir(tmp_path)
     assert main(["plan", "toy", "-o", "toy.polca", "--quiet"]) == 0
+    assert (
+        main(["plan", "tiger", "-o", "sightless.polca", "--trials", "2", "--episodes", "2", "--quiet"]) == 0
+    )
     capsys.readouterr()
     return tmp_path
 
