@@ -447,8 +447,8 @@ def test_names_of_strangers_can_do_nothing_to_the_terminal(say: Say) -> None:
 # -- simulate --------------------------------------------------------------------------------------
 
 SIMULATED = {
-    "peak_memory_bytes", "mean", "standard_error", "episodes", "steps", "ended", "truncation", "planned_value", "seed",
-    "tracker", "tracker_reason", "action_counts",
+    "mean", "standard_error", "episodes", "steps", "ended", "truncation", "planned_value", "seed",
+    "tracker", "tracker_reason", "action_counts", "peak_memory_bytes",
 }  # fmt: skip
 
 

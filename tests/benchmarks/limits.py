@@ -1,11 +1,12 @@
 """Run every command under limits on every shipped domain, at growing sizes up to the first limit.
 
-    python tests/benchmarks/limits.py [--memory 2GB] [--time 30] [WORD ...]
+    python tests/benchmarks/limits.py [--memory 2GB] [--time 30] [--command COMMAND] [WORD ...]
 
-Each run is a process of its own.  Good ends are a result (exit status 0) and a limit that is named (exit
-status 3 with `limit reached`).  Everything else is a fault and is shown at the end: a signal, a traceback,
-another status, a resident set beyond the limit by more than an eighth, or no end at all.  WORD picks the
-domains or commands whose name holds it.  Runs of a command on a domain go on until the first limit.
+Each run is a process of its own, a copy of this one with the kernels loaded.  Good ends are a result
+(exit status 0) and a limit that is named (exit status 3 with `limit reached`).  Everything else is a fault
+and is shown at the end: a signal, a traceback, another status, a resident set beyond the limit by more than
+an eighth, or no end at all.  WORD picks the domains whose name holds it.  Runs of a command on a domain go
+on until the first limit.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ from __future__ import annotations
 import argparse
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
 import time
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from factored_polca.cli import main as command_line
+from factored_polca.hierarchy.warm import warm_up
 
 SIZES: dict[str, tuple[str, ...]] = {
     "cheese": ("",),
@@ -89,48 +93,58 @@ class End:
 
 
 def run(command: list[str], folder: str, patience: float) -> End:
-    """Run one command."""
+    """Run one command in a copy of this process, which has the kernels loaded."""
     began = time.monotonic()
-    with open(Path(folder, "stderr"), "w+", encoding="utf-8", errors="replace") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "factored_polca", *command],
-            cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-        stopped = threading.Event()
+    log = Path(folder, "stderr")
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            os.chdir(folder)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT), 2)
+            status = command_line(command)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    stopped = threading.Event()
 
-        def stop() -> None:
-            stopped.set()
-            process.kill()
+    def stop() -> None:
+        stopped.set()
+        os.kill(child, signal.SIGKILL)
 
-        watch = threading.Timer(patience, stop)
-        watch.start()
-        _, code, usage = os.wait4(process.pid, 0)
-        watch.cancel()
-        process.returncode = os.waitstatus_to_exitcode(code)
-        errors.seek(0)
-        message = errors.read()
-    status = None if stopped.is_set() else process.returncode
-    return End(status, time.monotonic() - began, usage.ru_maxrss * 1024, message)
+    watch = threading.Timer(patience, stop)
+    watch.start()
+    _, code, usage = os.wait4(child, 0)
+    watch.cancel()
+    status_or_none = None if stopped.is_set() else os.waitstatus_to_exitcode(code)
+    message = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    return End(status_or_none, time.monotonic() - began, usage.ru_maxrss * 1024, message)
 
 
 def main() -> None:
     """Print the table, then the faults."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("words", nargs="*", metavar="WORD", help="domains or commands whose name holds it")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="domains whose name holds it")
     parser.add_argument("--memory", type=float, default=2.0, help="limit in GB")
     parser.add_argument("--time", type=float, default=30.0, help="limit in seconds")
     parser.add_argument(
         "--patience", type=float, default=600.0, help="seconds after which a run is stopped"
     )
+    parser.add_argument("--command", choices=COMMANDS, help="this command only")
     options = parser.parse_args()
     limits = ["--memory", f"{options.memory}GB", "--time", str(options.time), "--quiet"]
+    warm_up()
     faults = []
     print("| domain | size | command | end | |")
     print("|---|---|---|---|---|")
     for domain, sizes in SIZES.items():
         for name, words in COMMANDS.items():
-            if options.words and not any(word in domain or word in name for word in options.words):
+            if options.words and not any(word in domain for word in options.words):
+                continue
+            if options.command not in (None, name):
                 continue
             for size in sizes:
                 base, *settings = [*domain.split(), *size.split()]
