@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from factored_polca.cli.memory import current_memory_bytes, memory_text, peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_actions
 from factored_polca.formats import destination
@@ -25,21 +25,6 @@ ACTIONS_SHOWN = 30
 
 SMALLEST_STORE = 1 << 20
 """Bytes without which no model fits."""
-
-
-def peak_memory_bytes() -> int:
-    """The largest resident set of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
-
-
-def current_memory_bytes() -> int:
-    """The resident set now, or its peak where the system does not say."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[1]) * resource.getpagesize()
-    except OSError:
-        return peak_memory_bytes()
 
 
 def compile_kernels(output: Output, pomdp_method: str | None = None) -> float:
@@ -232,7 +217,7 @@ def print_minimisation(data: dict[str, Any], output: Output) -> None:
         )
     table.add_row("time", seconds(data["seconds"]))
     table.add_row("kernels loaded or compiled", seconds(data["compile_seconds"]))
-    table.add_row("peak memory", f"{data['peak_memory_bytes'] / 2**20:,.0f} MiB")
+    table.add_row("peak memory", memory_text(data["peak_memory_bytes"]))
     output.table(table)
     if "observations" in data:
         print_observations(data["observations"], output)

@@ -97,9 +97,12 @@ def parser() -> argparse.ArgumentParser:
             help="set a parameter; may be repeated",
         )
 
+    def with_memory(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit, such as 2GB")
+
     def with_limits(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
-        sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit, such as 2GB")
+        with_memory(sub)
         sub.add_argument("--time", type=positive, metavar="SECONDS", help="time limit")
         sub.add_argument("--order", default="auto", choices=ORDERS, help="order of the diagrams' variables")
         sub.add_argument("--reachable", action="store_true", help="only states that the start can reach")
@@ -107,7 +110,10 @@ def parser() -> argparse.ArgumentParser:
     command("domains", "List the shipped domains.")
     command("new", "Write a commented model to start from.").add_argument("name", metavar="NAME")
     with_model(command("info", "Describe a model, or a domain and its parameters."))
-    with_model(command("check", "Check a model and its tasks, and report all faults at once."))
+    sub = command("check", "Check a model and its tasks, and report all faults at once.")
+    with_model(sub)
+    with_memory(sub)
+    sub.add_argument("--time", type=positive, metavar="SECONDS", help="time limit of compiling the model")
     sub = command("minimise", "Merge the states that behave alike, exactly.")
     with_model(sub)
     with_limits(sub)
@@ -165,6 +171,7 @@ def parser() -> argparse.ArgumentParser:
     group.add_argument("--polca", action="store_true", help="plan as if the state were seen: PolCA")
     sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
     with_model(sub)
+    with_memory(sub)
     add_solving(sub)
     sub = command("act", "Say what a plan does in a state, or at a belief, and why.")
     sub.add_argument("plan", metavar="PLAN")
@@ -205,6 +212,10 @@ def parser() -> argparse.ArgumentParser:
     add_sensitivity(sub)
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
+    with_memory(sub)
+    sub.add_argument(
+        "--time", type=positive, metavar="SECONDS", help="time limit of compiling and minimising the model"
+    )
     sub.add_argument("output", metavar="OUT")
     sub.add_argument("--no-tasks", action="store_true", help="leave the tasks out")
     sub.add_argument("--minimise", action="store_true", help="write the quotient: a state for each block")

@@ -46,6 +46,22 @@ class Aborted(RuntimeError):
 
 
 def available_memory() -> int:
+    """Bytes of memory that this process may still take: what is free, or less where it has a limit."""
+    free = _free_memory()
+    try:
+        import resource  # not everywhere
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
+        if limit == resource.RLIM_INFINITY:
+            return free
+        with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+            taken = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData:"))
+    except (ImportError, OSError, StopIteration):
+        return free
+    return max(0, min(free, limit - taken))
+
+
+def _free_memory() -> int:
     """Bytes of memory that are free now, or 4 GiB where the system does not say."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
