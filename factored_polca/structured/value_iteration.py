@@ -18,7 +18,8 @@ t against the best choice anywhere has T_pi V >= T V - t, hence by the same theo
 are merged (`rounding`).  The width is a share of the interval that is still open, so that early sweeps run
 on small diagrams; where the interval does not shrink the share does.  It never falls below the rounding
 error, so that equal values which floats split are one leaf again.  Under a limit of nodes, or where memory
-is short, the width is what brings the diagram down to size: then the interval stays as wide as that makes it.
+is short, the width is what brings the diagram down to size: then the interval stays as wide as that makes
+it.
 
 Between two sweeps come some of the greedy policy alone (`policy_sweeps`).  Where no state's value is fixed
 V is moved to the middle of the interval while it pays (Porteus 1975).
@@ -58,6 +59,8 @@ FEWEST_NODES: Final = 64
 """A diagram is not made smaller than that to fit into memory."""
 POLICY_SWEEPS: Final = 8
 MOST_POLICY_SWEEPS: Final = 128
+SETTLED: Final = 0.02
+"""Sweeps of the policy alone end where what they still may gain is this share of the interval's half."""
 DEAR: Final = 0.7
 """No more sweeps of the policy alone where one takes more than this share of a whole sweep's work."""
 
@@ -292,9 +295,11 @@ class _Run:
         for number in range(self.policy_sweeps):
             start = self.work
             following = self.merged(sweep.apply(value, may_merge=settled))
-            if following == value:
+            if settled:
+                low, high = self.bellman.extremes(following - value)
+            value, before = following, value
+            if value == before or (settled and self.g * max(-low, high) <= SETTLED * self.known.radius):
                 break
-            value = following
             if not settled and number and self.work - start > DEAR * work:
                 break
         self.use(value)
