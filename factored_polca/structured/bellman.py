@@ -17,7 +17,9 @@ values out with d products, so with K = the sum of (d + 1) over the features,
     |computed Q - Q| <= (K + 6) u max |V| + (k + 3) u r                  u = 2^-53,
 
 where k is the number of reward terms of the action and r the sum of their largest values (Higham 2002,
-section 3.1, doubled here to cover terms of second order and numbers below the normal range).
+section 3.1, doubled here to cover terms of second order and numbers below the normal range).  Regressions
+that are rounded to multiples of a step on purpose (`stepped`) add gamma n step / 2, n features being
+changed.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from factored_polca.diagrams import FLOAT, Diagram, apply, choose
 from factored_polca.diagrams.operations import Walk
 from factored_polca.minimisation.criterion import DecisionProcess, largest_reward
 from factored_polca.structured.dead_ends import Safety, find_safety
-from factored_polca.symbolic import NumericView
+from factored_polca.structured.stepped import SteppedView
 from factored_polca.symbolic.floats import as_float
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
@@ -54,7 +56,7 @@ class Bellman:
         self.process = process
         symbolic = process.symbolic
         self.manager = symbolic.manager
-        self.numbers = NumericView(symbolic, FLOAT)
+        self.numbers = SteppedView(symbolic)
         self.discount = float(symbolic.model.discount)
         self.zero = self.numbers.zero
         self.lowest = self.manager.constant(-np.inf, FLOAT)
@@ -90,8 +92,17 @@ class Bellman:
 
     def error(self, largest: float) -> float:
         """A bound on |computed T V - T V| for |V| <= `largest`; it holds for each Q-value."""
+        return self.float_error(largest) + self.steps() * self.numbers.step / 2
+
+    def float_error(self, largest: float) -> float:
+        """The same without steps."""
         terms = (self._sum_terms + 6) * largest + (self._reward_terms + 3) * self.largest_reward
         return 2 * UNIT * terms + 1e-300
+
+    def steps(self) -> int:
+        """How often a regression rounds on one path, at most."""
+        actions = self.process.symbolic.actions
+        return max((len(actions[p].rows) for p in self.primitives), default=0)
 
     def masked(self, value: Diagram) -> Diagram:
         """`value` where there are choices, 0 elsewhere."""

@@ -51,6 +51,8 @@ SHARE: Final = 0.25
 """The width of merging at first, as a share of (1 - gamma) times half the open interval."""
 SHIFT_PROGRESS: Final = 0.9
 """V is moved to the middle where the interval is at most this share of what it was at the last move."""
+FLOOR: Final = 0.1
+"""The least width of merging, as a share of (1 - gamma) times half the interval that is asked for."""
 SLOW_SWEEPS: Final = 3
 """Slow sweeps in a row before leaves are merged less."""
 PATIENCE: Final = 20
@@ -233,7 +235,7 @@ class _Run:
             if self.known is found:
                 self.finish(q_values, best)
             return
-        self.adapt(found.radius, before, error)
+        self.adapt(found.radius, before)
         if self.status is not None:
             return
         moved = best
@@ -269,10 +271,11 @@ class _Run:
         """`best` + `shift` where there are choices."""
         return self.bellman.masked(map_leaves(best, lambda v: v + shift))
 
-    def adapt(self, radius: float, before: float, error: float) -> None:
+    def adapt(self, radius: float, before: float) -> None:
         """Merge less where the interval shrinks slowly, or give up."""
+        error_of_floats = self.bellman.float_error(self.largest)
         self.slow = self.slow + 1 if radius > (1 + self.discount) / 2 * before else 0
-        floor = 2 * error
+        floor = max(2 * error_of_floats, FLOOR * (1 - self.discount) * self.target())
         if self.slow >= SLOW_SWEEPS and self.width > floor and not self.squeezed:
             self.share /= 4
             self.slow = 0
@@ -280,6 +283,7 @@ class _Run:
         if self.idle >= PATIENCE and (self.width <= floor or self.squeezed):
             self.status = "memory limit" if self.squeezed else "rounding limit"
         self.width = max(self.share * (1 - self.discount) * self.known.radius, floor)
+        self.bellman.numbers.use_step(self.width / max(1, self.bellman.steps()))
 
     def next_values(self, value: Diagram, choices: Diagram, work: int) -> None:
         """V for the next sweep: `value` after some sweeps of the policy, with leaves merged."""
