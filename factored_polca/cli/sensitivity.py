@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 from factored_polca.cli.commands import (
     compile_kernels,
     limits,
-    peak_memory_bytes,
     refuse_unwritable,
     report_warnings,
 )
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load
 

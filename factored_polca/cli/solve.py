@@ -13,6 +13,7 @@ import numpy as np
 
 from factored_polca.cli.commands import (
     compile_kernels,
+    limits,
     refuse_unwritable,
     report_warnings,
 )
@@ -35,6 +36,7 @@ MDP_METHODS: Final = {
     "vi": "value iteration",
     "pi": "policy iteration",
     "mpi": "modified policy iteration",
+    "structured": "structured value iteration",
 }
 STAGED: Final = ("auto", "exact", "witness")
 """POMDP solvers that take a horizon."""
@@ -91,6 +93,7 @@ class Found:
 
 def solve(arguments: argparse.Namespace, output: Output) -> int:
     """Solve a model as it is, print bounds and what they mean, write the policy."""
+    from factored_polca.cli.solve_large import listed_unless_large, solve_large
     from factored_polca.hierarchy.policy_file import FlatPolicy, save_policy
     from factored_polca.symbolic import compile_model
 
@@ -102,7 +105,10 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
     compile_seconds = warm(task, output)
     began = time.perf_counter()
     with source.located(), output.progress(f"listing the states of {source.name}"):
-        flat = listed(compile_model(task.model), task)
+        symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
+        flat = listed_unless_large(symbolic, task)
+    if isinstance(flat, str):
+        return solve_large(symbolic, task, flat, source, arguments, output, compile_seconds)
     build_seconds = time.perf_counter() - began
     with output.progress(f"solving {source.name}"):
         found, compiled = work(task, flat, source, output)

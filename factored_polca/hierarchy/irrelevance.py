@@ -35,7 +35,7 @@ import numpy.typing as npt
 from factored_polca.diagrams import FLOAT, INDEX, Diagram, relabel
 from factored_polca.hierarchy.executable import ExecutablePlan, TaskPolicy, executable, task_policy
 from factored_polca.hierarchy.plan import HierarchicalPlan
-from factored_polca.hierarchy.solved import SolvedTask
+from factored_polca.hierarchy.solved import SolvedTask, StructuredTask
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import Fault, ModelError
@@ -228,5 +228,9 @@ def executable_by_classes(
     Raises:
         ValueError, ModelError: see `value_classes`.
     """
-    policies = {s.task.name: value_classes(s, kind, within).policy for s in plan.solved}
+    without = [s.task.name for s in plan.solved if isinstance(s, StructuredTask)]
+    if without:
+        raise ValueError(f"task {without[0]!r} was solved on diagrams: it has no blocks to be merged")
+    solved = [s for s in plan.solved if isinstance(s, SolvedTask)]
+    policies = {s.task.name: value_classes(s, kind, within).policy for s in solved}
     return replace(executable(plan, report), policies=policies)

@@ -28,6 +28,7 @@ from factored_polca.approximation.approximate import (
 )
 from factored_polca.approximation.snap import Snapped, as_epsilon, snap
 from factored_polca.diagrams import FLOAT, Aborted, Diagram, MemoryLimit, choose, leaves
+from factored_polca.hierarchy.evaluation import Evaluation
 from factored_polca.hierarchy.options import Options
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.minimisation.criterion import ProcessView, policy_primitives
@@ -35,17 +36,6 @@ from factored_polca.models import Fault, LimitReached, Model, ModelError
 from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
 from factored_polca.solvers.pomdp_result import POMDPSolution
 from factored_polca.symbolic import NumericView, SymbolicModel
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The value of something at the initial belief: bounds, and how it was found."""
-
-    value: float
-    lower: float
-    upper: float
-    blocks: int
-    guarantee: Guarantee
 
 
 @dataclass(frozen=True)
