@@ -1,0 +1,280 @@
+"""Float diagrams as flat arrays, and their expectations under beliefs that are products.
+
+A `Forest` holds diagrams one after the other, children before parents:
+
+    levels[n]     the level of node n; `leaf_level` for a leaf
+    first[n]      where the children of n begin in `children`; a leaf has none
+    value[n]      the value of a leaf
+
+Under a product of distributions m_l, one for each level, the expectation of a diagram is one pass from the
+leaves up, E(n) = sum over v of m_l(v) E(child_v(n)): a level that is skipped counts 1.
+
+Where some levels, the *cluster* C, have a joint distribution beta, a diagram of its own, the pass runs down
+both at once:
+
+    E(n, q) = sum over v of E(n_v, q_v)           at a level l of C
+              sum over v of m_l(v) E(n_v, q)      at another level
+
+times the number of ways that levels of C which both skip may go.  Pairs are remembered in a lossy table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from factored_polca.diagrams import FLOAT, Diagram, Manager
+from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.diagrams.manager import require
+from factored_polca.diagrams.operations import Walk
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Int32Array = npt.NDArray[np.int32]
+
+REMEMBERED = 1 << 18
+"""Pairs of nodes that the table of a pass over two diagrams holds."""
+
+
+@kernel
+def export(
+    pool: Int32Array, arity: Int32Array, nodes: Int32Array, base: int, first_child: int,
+    levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray,
+) -> int:  # fmt: skip
+    """Write collected nodes, numbered in their scratch words, as flat arrays; the number of children."""
+    leaf_level = len(arity) - 1
+    count = 0
+    for i in range(len(nodes)):
+        node = int64(nodes[i])
+        level = pool[node]
+        levels[i] = level
+        first[i] = first_child + count
+        if level == leaf_level:
+            low = np.uint64(np.uint32(pool[node + 2]))
+            high = np.uint64(np.uint32(pool[node + 3]))
+            value[i] = np.uint64(low | (high << np.uint64(32))).view(np.float64)
+            continue
+        for v in range(arity[level]):
+            children[count] = base + pool[pool[node + 2 + v] + 1]
+            count += 1
+    return count
+
+
+@kernel
+def expectations(
+    levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray, sizes: Int32Array,
+    offset: IntArray, marginals: FloatArray, start: int, out: FloatArray,
+) -> None:  # fmt: skip
+    """E(n) for the nodes from `start` on, which have no child before it; out[n - start]."""
+    leaf_level = len(sizes) - 1
+    for i in range(len(out)):
+        n = start + i
+        level = levels[n]
+        if level == leaf_level:
+            out[i] = value[n]
+            continue
+        total = 0.0
+        at = int64(first[n])
+        o = offset[level]
+        for v in range(sizes[level]):
+            m = marginals[o + v]
+            if m != 0.0:
+                total += m * out[children[at + v] - start]
+        out[i] = total
+
+
+@kernel
+def pair_expectation(
+    a: int, b: int, levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray,
+    b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array, b_value: FloatArray,
+    sizes: Int32Array, offset: IntArray, marginals: FloatArray, ways: FloatArray,
+    keys: IntArray, found: FloatArray, stamp: int,
+) -> float:  # fmt: skip
+    """E(a, b) over the levels from the upper one of both on; `ways[l]` counts the cluster above l."""
+    leaf_level = len(sizes) - 1
+    la = levels[a]
+    lb = b_levels[b]
+    if lb == leaf_level:
+        if b_value[b] == 0.0:
+            return 0.0
+        if la == leaf_level:
+            return value[a] * b_value[b]
+    level = min(la, lb)
+    key = stamp + b * len(levels) + a
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
+    if keys[slot] == key:
+        return found[slot]
+    clustered = ways[level + 1] != ways[level] or lb == level
+    after = ways[level + 1]
+    total = 0.0
+    for v in range(sizes[level]):
+        x = int64(children[first[a] + v]) if la == level else a
+        y = int64(b_children[b_first[b] + v]) if lb == level else b
+        m = 1.0 if clustered else marginals[offset[level] + v]
+        if m == 0.0:
+            continue
+        below = pair_expectation(
+            x, y, levels, first, children, value, b_levels, b_first, b_children, b_value,
+            sizes, offset, marginals, ways, keys, found, stamp,
+        )  # fmt: skip
+        lowest = min(levels[x], b_levels[y])
+        total += m * below * (ways[lowest] / after)
+    keys[slot] = key
+    found[slot] = total
+    return total
+
+
+@kernel
+def pair_ratio(
+    place: int, a: int, b: int, order: IntArray, in_a: IntArray, in_b: IntArray,
+    a_levels: Int32Array, a_first: Int32Array, a_children: Int32Array, a_value: FloatArray,
+    b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array, b_value: FloatArray,
+    sizes: Int32Array, offset: IntArray, a_marginals: FloatArray, b_marginals: FloatArray,
+    keys: IntArray, found: FloatArray, stamp: int,
+) -> float:  # fmt: skip
+    """The least a / b over the states of the levels order[place:] with b > 0; infinity without one."""
+    if place == len(order):
+        if b_value[b] == 0.0:
+            return np.inf
+        return a_value[a] / b_value[b]
+    key = stamp + (place * len(b_levels) + b) * len(a_levels) + a
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
+    if keys[slot] == key:
+        return found[slot]
+    level = order[place]
+    least = np.inf
+    for v in range(sizes[level]):
+        weight = 1.0
+        if in_b[place] == 0:
+            if b_marginals[offset[level] + v] == 0.0:
+                continue
+            weight /= b_marginals[offset[level] + v]
+        if in_a[place] == 0:
+            weight *= a_marginals[offset[level] + v]
+        x = int64(a_children[a_first[a] + v]) if a_levels[a] == level else a
+        y = int64(b_children[b_first[b] + v]) if b_levels[b] == level else b
+        below = pair_ratio(
+            place + 1, x, y, order, in_a, in_b, a_levels, a_first, a_children, a_value,
+            b_levels, b_first, b_children, b_value, sizes, offset, a_marginals, b_marginals,
+            keys, found, stamp,
+        )  # fmt: skip
+        if below < np.inf:
+            least = min(least, weight * below)
+        if least == 0.0:
+            break
+    keys[slot] = key
+    found[slot] = least
+    return least
+
+
+class Remembered:
+    """The lossy table that passes over two diagrams share; entries of earlier passes never match."""
+
+    def __init__(self) -> None:
+        self.keys: IntArray = np.full(REMEMBERED, -1, dtype=np.int64)
+        self.found: FloatArray = np.empty(REMEMBERED)
+        self.stamp = 0
+
+    def next_pass(self, pairs: int) -> int:
+        """Where the keys of the next pass begin, which has so many pairs at most."""
+        begin = self.stamp
+        self.stamp += pairs
+        if self.stamp >= 2**62:
+            self.keys[:] = -1
+            begin, self.stamp = 0, pairs
+        return begin
+
+
+class Forest:
+    """Diagrams as flat arrays; `roots[i]` is the node of the i-th that was added."""
+
+    def __init__(self, manager: Manager) -> None:
+        self.manager = manager
+        self.sizes: Int32Array = manager.arity
+        self.levels: Int32Array = np.empty(64, dtype=np.int32)
+        self.first: Int32Array = np.empty(64, dtype=np.int32)
+        self.value: FloatArray = np.zeros(64)
+        self.children: Int32Array = np.empty(128, dtype=np.int32)
+        self.nodes = 0
+        self.edges = 0
+        self.roots: list[int] = []
+        self.starts: list[int] = []  # [i] the first node of the i-th diagram
+
+    def __len__(self) -> int:
+        return len(self.roots)
+
+    def add(self, diagram: Diagram) -> int:
+        """Append a float diagram; its number."""
+        require((diagram,), FLOAT)
+        manager = self.manager
+        walk = Walk(diagram)
+        count = len(walk.nodes)
+        edges = int(manager.arity[walk.levels[~walk.is_leaf]].sum())
+        self._room(count, edges)
+        begin, end = self.nodes, self.nodes + count
+        export(
+            manager.pool, manager.arity, walk.nodes, begin, self.edges, self.levels[begin:end],
+            self.first[begin:end], self.children[self.edges :], self.value[begin:end],
+        )  # fmt: skip
+        self.starts.append(begin)
+        self.nodes, self.edges = end, self.edges + edges
+        self.roots.append(end - 1)
+        return len(self.roots) - 1
+
+    def _room(self, nodes: int, edges: int) -> None:
+        if self.nodes + nodes > len(self.levels):
+            size = 2 * (self.nodes + nodes)
+            self.levels = _longer(self.levels, size)
+            self.first = _longer(self.first, size)
+            self.value = _longer(self.value, size)
+        if self.edges + edges > len(self.children):
+            self.children = _longer(self.children, 2 * (self.edges + edges))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the arrays take."""
+        return self.levels.nbytes + self.first.nbytes + self.value.nbytes + self.children.nbytes
+
+    def under_product(self, offset: IntArray, marginals: FloatArray, since: int = 0) -> FloatArray:
+        """The expectations of the diagrams from number `since` on, under a product of distributions."""
+        if since >= len(self.roots):
+            return np.empty(0)
+        start = self.starts[since]
+        out = np.empty(self.nodes - start)
+        expectations(
+            self.levels, self.first, self.children, self.value, self.sizes, offset, marginals, start, out
+        )
+        result: FloatArray = out[np.array(self.roots[since:]) - start]
+        return result
+
+    def under_joint(
+        self,
+        joint: Forest,
+        ways: FloatArray,
+        offset: IntArray,
+        marginals: FloatArray,
+        table: Remembered,
+        since: int = 0,
+    ) -> FloatArray:
+        """The same where a cluster has the joint distribution that `joint` holds as its one diagram."""
+        result = np.empty(len(self.roots) - since)
+        top = joint.roots[0]
+        stamp = table.next_pass(len(self.levels) * len(joint.levels))
+        for i, root in enumerate(self.roots[since:]):
+            below = pair_expectation(
+                root, top, self.levels, self.first, self.children, self.value,
+                joint.levels, joint.first, joint.children, joint.value,
+                self.sizes, offset, marginals, ways, table.keys, table.found, stamp,
+            )  # fmt: skip
+            result[i] = below * ways[min(self.levels[root], joint.levels[top])]
+        return result
+
+
+def _longer(array: Any, size: int) -> Any:
+    result = np.zeros(size, dtype=array.dtype)
+    result[: len(array)] = array
+    return result
