@@ -86,89 +86,157 @@ def expectations(
 
 
 @kernel
-def pair_expectation(
-    a: int, b: int, levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray,
-    b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array, b_value: FloatArray,
-    sizes: Int32Array, offset: IntArray, marginals: FloatArray, ways: FloatArray,
-    keys: IntArray, found: FloatArray, stamp: int,
-) -> float:  # fmt: skip
-    """E(a, b) over the levels from the upper one of both on; `ways[l]` counts the cluster above l."""
+def pair_expectations(
+    roots: IntArray, top: int, levels: Int32Array, first: Int32Array, children: Int32Array,
+    value: FloatArray, b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array,
+    b_value: FloatArray, sizes: Int32Array, offset: IntArray, marginals: FloatArray, ways: FloatArray,
+    keys: IntArray, found: FloatArray, stamp: int, out: FloatArray,
+) -> None:  # fmt: skip
+    """E(root, top) for each root; `ways[l]` counts the states of the cluster's levels above l.
+
+    An open pair stands in `a`, `b` with its next value `k`, its sum so far, and the factor of the value
+    under way.
+    """
     leaf_level = len(sizes) - 1
-    la = levels[a]
-    lb = b_levels[b]
-    if lb == leaf_level:
-        if b_value[b] == 0.0:
-            return 0.0
-        if la == leaf_level:
-            return value[a] * b_value[b]
-    level = min(la, lb)
-    key = stamp + b * len(levels) + a
-    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
-    if keys[slot] == key:
-        return found[slot]
-    clustered = ways[level + 1] != ways[level] or lb == level
-    after = ways[level + 1]
-    total = 0.0
-    for v in range(sizes[level]):
-        x = int64(children[first[a] + v]) if la == level else a
-        y = int64(b_children[b_first[b] + v]) if lb == level else b
-        m = 1.0 if clustered else marginals[offset[level] + v]
-        if m == 0.0:
-            continue
-        below = pair_expectation(
-            x, y, levels, first, children, value, b_levels, b_first, b_children, b_value,
-            sizes, offset, marginals, ways, keys, found, stamp,
-        )  # fmt: skip
-        lowest = min(levels[x], b_levels[y])
-        total += m * below * (ways[lowest] / after)
-    keys[slot] = key
-    found[slot] = total
-    return total
+    a = np.empty(leaf_level + 2, np.int64)
+    b = np.empty(leaf_level + 2, np.int64)
+    k = np.empty(leaf_level + 2, np.int64)
+    total = np.empty(leaf_level + 2)
+    factor = np.empty(leaf_level + 2)
+    for i in range(len(roots)):
+        a[0] = roots[i]
+        b[0] = top
+        k[0] = -1
+        sp = 0
+        result = 0.0
+        while sp >= 0:
+            x = a[sp]
+            y = b[sp]
+            level = min(levels[x], b_levels[y])
+            if k[sp] < 0:  # a new pair
+                closed = True
+                key = stamp + y * len(levels) + x
+                h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+                slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
+                if b_levels[y] == leaf_level and b_value[y] == 0.0:
+                    result = 0.0
+                elif level == leaf_level:
+                    result = value[x] * b_value[y]
+                elif keys[slot] == key:
+                    result = found[slot]
+                else:
+                    closed = False
+                if closed:
+                    sp -= 1
+                    continue
+                k[sp] = 0
+                total[sp] = 0.0
+            else:
+                total[sp] += factor[sp] * result
+            v = k[sp]
+            clustered = b_levels[y] == level or ways[level + 1] != ways[level]
+            m = 0.0
+            while v < sizes[level]:
+                m = 1.0 if clustered else marginals[offset[level] + v]
+                if m != 0.0:
+                    break
+                v += 1
+            if v == sizes[level]:
+                result = total[sp]
+                key = stamp + y * len(levels) + x
+                h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+                slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
+                keys[slot] = key
+                found[slot] = result
+                sp -= 1
+                continue
+            k[sp] = v + 1
+            if levels[x] == level:
+                x = int64(children[first[x] + v])
+            if b_levels[y] == level:
+                y = int64(b_children[b_first[y] + v])
+            factor[sp] = m * ways[min(levels[x], b_levels[y])] / ways[level + 1]
+            sp += 1
+            a[sp] = x
+            b[sp] = y
+            k[sp] = -1
+        out[i] = result * ways[min(levels[roots[i]], b_levels[top])]
 
 
 @kernel
 def pair_ratio(
-    place: int, a: int, b: int, order: IntArray, in_a: IntArray, in_b: IntArray,
+    a_root: int, b_root: int, order: IntArray, in_a: IntArray, in_b: IntArray,
     a_levels: Int32Array, a_first: Int32Array, a_children: Int32Array, a_value: FloatArray,
     b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array, b_value: FloatArray,
     sizes: Int32Array, offset: IntArray, a_marginals: FloatArray, b_marginals: FloatArray,
     keys: IntArray, found: FloatArray, stamp: int,
 ) -> float:  # fmt: skip
-    """The least a / b over the states of the levels order[place:] with b > 0; infinity without one."""
-    if place == len(order):
-        if b_value[b] == 0.0:
-            return np.inf
-        return a_value[a] / b_value[b]
-    key = stamp + (place * len(b_levels) + b) * len(a_levels) + a
-    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
-    if keys[slot] == key:
-        return found[slot]
-    level = order[place]
-    least = np.inf
-    for v in range(sizes[level]):
-        weight = 1.0
-        if in_b[place] == 0:
-            if b_marginals[offset[level] + v] == 0.0:
+    """The least a / b over the states of the levels `order` with b > 0; infinity without one.
+
+    Where a level is not `in_a`, a is a product there with its marginals, and so for b.
+    """
+    depth = len(order)
+    a = np.empty(depth + 1, np.int64)
+    b = np.empty(depth + 1, np.int64)
+    k = np.empty(depth + 1, np.int64)
+    least = np.empty(depth + 1)
+    factor = np.empty(depth + 1)
+    a[0] = a_root
+    b[0] = b_root
+    k[0] = -1
+    sp = 0
+    result = np.inf
+    while sp >= 0:
+        x = a[sp]
+        y = b[sp]
+        key = stamp + (sp * len(b_levels) + y) * len(a_levels) + x
+        h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+        slot = int64(h >> np.uint64(32)) & (len(keys) - 1)
+        if k[sp] < 0:
+            if sp == depth:
+                result = np.inf
+                if b_value[y] != 0.0:
+                    result = a_value[x] / b_value[y]
+                sp -= 1
                 continue
-            weight /= b_marginals[offset[level] + v]
-        if in_a[place] == 0:
+            if keys[slot] == key:
+                result = found[slot]
+                sp -= 1
+                continue
+            k[sp] = 0
+            least[sp] = np.inf
+        elif result < np.inf:
+            least[sp] = min(least[sp], factor[sp] * result)
+        level = order[sp]
+        v = k[sp]
+        weight = 1.0
+        while v < sizes[level]:
+            weight = 1.0
+            if in_b[sp] == 0:
+                weight = b_marginals[offset[level] + v]
+            if weight != 0.0:
+                break
+            v += 1
+        if v == sizes[level] or least[sp] == 0.0:
+            result = least[sp]
+            keys[slot] = key
+            found[slot] = result
+            sp -= 1
+            continue
+        weight = 1.0 / weight
+        if in_a[sp] == 0:
             weight *= a_marginals[offset[level] + v]
-        x = int64(a_children[a_first[a] + v]) if a_levels[a] == level else a
-        y = int64(b_children[b_first[b] + v]) if b_levels[b] == level else b
-        below = pair_ratio(
-            place + 1, x, y, order, in_a, in_b, a_levels, a_first, a_children, a_value,
-            b_levels, b_first, b_children, b_value, sizes, offset, a_marginals, b_marginals,
-            keys, found, stamp,
-        )  # fmt: skip
-        if below < np.inf:
-            least = min(least, weight * below)
-        if least == 0.0:
-            break
-    keys[slot] = key
-    found[slot] = least
-    return least
+        k[sp] = v + 1
+        factor[sp] = weight
+        if a_levels[x] == level:
+            x = int64(a_children[a_first[x] + v])
+        if b_levels[y] == level:
+            y = int64(b_children[b_first[y] + v])
+        sp += 1
+        a[sp] = x
+        b[sp] = y
+        k[sp] = -1
+    return result
 
 
 class Remembered:
@@ -262,15 +330,13 @@ class Forest:
     ) -> FloatArray:
         """The same where a cluster has the joint distribution that `joint` holds as its one diagram."""
         result = np.empty(len(self.roots) - since)
-        top = joint.roots[0]
         stamp = table.next_pass(len(self.levels) * len(joint.levels))
-        for i, root in enumerate(self.roots[since:]):
-            below = pair_expectation(
-                root, top, self.levels, self.first, self.children, self.value,
-                joint.levels, joint.first, joint.children, joint.value,
-                self.sizes, offset, marginals, ways, table.keys, table.found, stamp,
-            )  # fmt: skip
-            result[i] = below * ways[min(self.levels[root], joint.levels[top])]
+        pair_expectations(
+            np.array(self.roots[since:], dtype=np.int64), joint.roots[0],
+            self.levels, self.first, self.children, self.value,
+            joint.levels, joint.first, joint.children, joint.value,
+            self.sizes, offset, marginals, ways, table.keys, table.found, stamp, result,
+        )  # fmt: skip
         return result
 
 

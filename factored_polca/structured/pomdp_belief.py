@@ -204,6 +204,7 @@ class BeliefSpace:
         self.table = Remembered()
         self.unit = Forest(pomdp.manager)
         self.unit.add(pomdp.one)
+        self.levels: IntArray = np.array(sorted(symbolic.now(k) for k in pomdp.hidden), dtype=np.int64)
         self._feature_at = {symbolic.now(k): k for k in pomdp.hidden}
         self._feature_at |= {symbolic.next(k): k for k in pomdp.hidden}
         self._tables: dict[tuple[Seen, int], StepTable] = {}
@@ -225,6 +226,10 @@ class BeliefSpace:
             later = level != now(k) or k not in step.changed
             found.add(2 * self.place[k] + later)
         return frozenset(found)
+
+    def clustered(self, belief: PointBelief) -> IntArray:
+        """Whether each of `levels` is of the cluster."""
+        return np.isin(self.levels, belief.cluster).astype(np.int64)
 
     def expectations(self, belief: PointBelief, forest: Forest, since: int = 0) -> FloatArray:
         """The expectations of the diagrams of a forest, from number `since` on."""

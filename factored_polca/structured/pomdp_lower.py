@@ -16,8 +16,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from factored_polca.diagrams import FLOAT, Diagram, choose, node_count
 from factored_polca.structured.alpha_forest import Forest
 from factored_polca.structured.pomdp_belief import BeliefSpace, FloatArray, PointBelief
@@ -27,11 +25,12 @@ from factored_polca.structured.rounding import round_leaves, round_to_size
 
 @dataclass(frozen=True, eq=False)
 class Alpha:
-    """An alpha-vector at one y: what a plan earns that begins with `action`.
+    """An alpha-vector at the y `seen`: what a plan earns that begins with `action`.
 
     `children` are those that it goes on with; a blind policy goes on with itself at the next y and has none.
     """
 
+    seen: Seen
     action: int
     diagram: Diagram
     children: tuple[Alpha, ...] = ()
@@ -90,7 +89,7 @@ class LowerBound:
     def at(self, seen: Seen) -> AlphaSet:
         """The alpha-vectors at one y; at first those of the blind policies."""
         if seen not in self.sets:
-            found = [Alpha(a, self.pomdp.at(seen, d), blind=True) for a, d in self.blind]
+            found = [Alpha(seen, a, self.pomdp.at(seen, d), blind=True) for a, d in self.blind]
             distinct: list[Alpha] = []
             for alpha in found:
                 if all(alpha.diagram != other.diagram for other in distinct):
@@ -126,7 +125,7 @@ class LowerBound:
             rounded = round_to_size(total, nodes=self.nodes, width=self.width, direction="down")
         self.loss = max(self.loss, rounded.error)
         distinct = {id(alpha): alpha for alpha in chosen}
-        return Alpha(step.action, rounded.diagram, tuple(distinct.values()))
+        return Alpha(step.seen, step.action, rounded.diagram, tuple(distinct.values()))
 
 
 def closure(alphas: Iterable[Alpha]) -> list[Alpha]:
@@ -140,7 +139,3 @@ def closure(alphas: Iterable[Alpha]) -> list[Alpha]:
             waiting += alpha.children
     return list(found.values())
 
-
-def best(values: FloatArray) -> int:
-    """The first largest."""
-    return int(np.argmax(values))

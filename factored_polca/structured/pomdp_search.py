@@ -66,7 +66,7 @@ class Node:
     best: Alpha
     looked: int  # alpha-vectors of its y looked at, of this version of the set
     version: int
-    seen_points: int = -1
+    seen_points: int = 0  # entries of the log of points looked at
     point: int = -1  # its number among the points of the upper bound
     visits: int = 0
     expanded: dict[int, Expansion] = field(default_factory=dict)
@@ -122,24 +122,25 @@ class Search:
             self.by_seen.setdefault(belief.seen, []).append(found)
         return found
 
-    def refresh(self, node: Node) -> None:
-        """Bounds of a node from what has been learnt elsewhere."""
+    def refresh_lower(self, node: Node) -> None:
+        """The lower bound of a node from alpha-vectors that it has not seen."""
         alphas = self.lower.at(node.belief.seen)
-        since = node.looked if node.version == alphas.version else min(node.looked, alphas.kept)
-        if node.version != alphas.version:
-            since = 0
+        since = node.looked if node.version == alphas.version else 0
         if since < len(alphas.alphas):
             values = self.lower.values(node.belief, since)
             chosen = int(values.argmax())
             value = float(values[chosen]) - self.read_error
             if value > node.lower:
                 node.lower, node.best = value, alphas.alphas[since + chosen]
-        node.looked, node.version = len(alphas.alphas), alphas.version
+            node.looked, node.version = len(alphas.alphas), alphas.version
+
+    def refresh_upper(self, node: Node) -> None:
+        """The upper bound of a node from points that it has not seen."""
         points = self.upper.at(node.belief.seen)
-        if points.changes != node.seen_points:
-            bound = points.bound(node.belief, node.quality) + self.read_error
+        if len(points.log) > node.seen_points:
+            bound = points.bound(node.belief, node.quality, node.seen_points) + self.read_error
             node.upper = min(node.upper, bound)
-            node.seen_points = points.changes
+            node.seen_points = len(points.log)
 
     def expand(self, node: Node, action: int) -> Expansion:
         """What follows a node under an action."""
@@ -165,7 +166,7 @@ class Search:
         after = 0.0
         for chance, child in zip(expansion.chances, expansion.children, strict=True):
             if child is not None:
-                self.refresh(child)
+                self.refresh_upper(child)
                 after += chance * child.upper
         bound = expansion.reward + self.discount * after + self.backup_error
         node.uppers[action] = min(float(node.uppers[action]), bound)
@@ -201,12 +202,12 @@ class Search:
             value = 0.0
             for chance, child in zip(expansion.chances, expansion.children, strict=True):
                 if child is not None:
-                    self.refresh(child)
+                    self.refresh_lower(child)
                     value += chance * child.lower
             value = expansion.reward + self.discount * value
             if value > best:
                 best, chosen = value, action
-        self.refresh(node)
+        self.refresh_lower(node)
         if not best > node.lower + 4 * self.read_error:
             return
         expansion = node.expanded[chosen]
@@ -218,7 +219,7 @@ class Search:
         self.backups += 1
         known = self.lower.at(node.belief.seen)
         known.add(alpha)
-        self.refresh(node)
+        self.refresh_lower(node)
         if len(known.alphas) > 2 * known.kept + PRUNE_AT:
             self.prune(node.belief.seen)
 
@@ -228,7 +229,7 @@ class Search:
         numbers = {id(alpha): n for n, alpha in enumerate(known.alphas)}
         used = {n for n, alpha in enumerate(known.alphas) if alpha.blind}
         for node in self.by_seen.get(seen, ()):
-            self.refresh(node)
+            self.refresh_lower(node)
             if id(node.best) in numbers:
                 used.add(numbers[id(node.best)])
         known.keep(sorted(used))
@@ -256,7 +257,8 @@ class Search:
             most, following = 0.0, None
             for chance, child in zip(expansion.chances, expansion.children, strict=True):
                 if child is not None:
-                    self.refresh(child)
+                    self.refresh_lower(child)
+                    self.refresh_upper(child)
                     excess = chance * (child.gap - aim)
                     if excess > most:
                         most, following = excess, child

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from factored_polca.diagrams import Diagram
 from factored_polca.diagrams.jit import kernel
 from factored_polca.structured.alpha_forest import Forest, pair_ratio
 from factored_polca.structured.pomdp_belief import BeliefSpace, PointBelief
@@ -21,23 +22,28 @@ from factored_polca.structured.pomdp_model import Seen
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+Int32Array = npt.NDArray[np.int32]
+BoolArray = npt.NDArray[np.bool_]
 
 SHRUNK = 1 - 1e-12
 """What a computed ratio is multiplied by, to be below the exact one."""
 
-JOINT_POINTS = 200
-"""Points with joint distributions that are compared with a belief, the latest ones."""
+LOOKED_BACK = 2_000
+"""Changes of points that a belief catches up with, the latest ones."""
 
 
 @kernel
 def sawtooth(
     marginals: FloatArray, quality: FloatArray, points: FloatArray, values: FloatArray, base: FloatArray,
-    groups: IntArray, count: int, usable: npt.NDArray[np.bool_], shrunk: float,
+    groups: IntArray, chosen: IntArray, product: BoolArray, shrunk: float,
 ) -> float:  # fmt: skip
-    """The least bound at a product belief by `count` points; `groups` has an end after the last."""
+    """The least bound at a product belief by those of the chosen points that are products.
+
+    `groups` has an end after the last feature.
+    """
     best = np.inf
-    for j in range(count):
-        if not usable[j]:
+    for j in chosen:
+        if not product[j]:
             continue
         phi = shrunk
         for g in range(len(groups) - 1):
@@ -58,8 +64,39 @@ def sawtooth(
     return best
 
 
+@kernel
+def joint_sawtooth(
+    marginals: FloatArray, quality: FloatArray, points: FloatArray, values: FloatArray, base: FloatArray,
+    chosen: IntArray, all_of_them: bool, product: BoolArray, shrunk: float,
+    order: IntArray, in_a: IntArray, in_b: IntArray, a_root: int, b_roots: IntArray,
+    a_levels: Int32Array, a_first: Int32Array, a_children: Int32Array, a_value: FloatArray,
+    b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array, b_value: FloatArray,
+    sizes: Int32Array, offset: IntArray, keys: IntArray, found: FloatArray, stamp: int,
+) -> float:  # fmt: skip
+    """The same by those that are no products, or by all, at any belief."""
+    best = np.inf
+    for j in chosen:
+        if product[j] and not all_of_them:
+            continue
+        phi = shrunk * pair_ratio(
+            a_root, b_roots[j], order, in_a, in_b[j], a_levels, a_first, a_children, a_value,
+            b_levels, b_first, b_children, b_value, sizes, offset, marginals, points[j],
+            keys, found, stamp + j * (len(order) + 1) * len(b_levels) * len(a_levels),
+        )  # fmt: skip
+        if phi <= 0.0 or phi == np.inf:
+            continue
+        rest = -np.inf
+        for a in range(len(quality)):
+            rest = max(rest, quality[a] - phi * base[j, a])
+        best = min(best, phi * values[j] + rest)
+    return best
+
+
 class PointSet:
-    """The explored beliefs at one y, and the base bounds there."""
+    """The explored beliefs at one y, and the base bounds there.
+
+    `log` lists the points as they came or were bettered: a belief looks at what is new to it.
+    """
 
     def __init__(self, space: BeliefSpace, forest: Forest) -> None:
         self.space, self.forest = space, forest
@@ -69,93 +106,70 @@ class PointSet:
         self.points: FloatArray = np.zeros((8, space.entries))
         self.base: FloatArray = np.zeros((8, actions))
         self.values: FloatArray = np.zeros(8)
-        self.product: npt.NDArray[np.bool_] = np.zeros(8, dtype=np.bool_)
-        self.beliefs: list[PointBelief] = []
-        self.changes = 0
+        self.product: BoolArray = np.zeros(8, dtype=np.bool_)
+        self.clustered: IntArray = np.zeros((8, len(space.levels)), dtype=np.int64)
+        self.joint_roots: IntArray = np.zeros(8, dtype=np.int64)
+        self.joints = Forest(space.pomdp.manager)
+        self.joints.add(space.pomdp.one)
+        self.log: list[int] = []
+        self.joint_points = 0
 
     def add(self, belief: PointBelief, quality: FloatArray, value: float) -> int:
         """One more point; its number."""
         if self.count == len(self.values):
-            self.points = np.concatenate([self.points, np.zeros_like(self.points)])
-            self.base = np.concatenate([self.base, np.zeros_like(self.base)])
-            self.values = np.concatenate([self.values, np.zeros_like(self.values)])
-            self.product = np.concatenate([self.product, np.zeros_like(self.product)])
+            for name in ("points", "base", "values", "product", "clustered", "joint_roots"):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
         j = self.count
         self.points[j], self.base[j], self.values[j] = belief.marginals, quality, value
-        self.product[j] = not belief.cluster
-        self.beliefs.append(belief)
+        self.product[j] = belief.diagram is None
+        self.clustered[j] = self.space.clustered(belief)
+        self.joint_roots[j] = 0
+        if belief.diagram is not None:
+            self.joints.add(belief.diagram)
+            self.joint_roots[j] = self.joints.roots[-1]
+            self.joint_points += 1
         self.count += 1
-        self.changes += 1
+        self.log.append(j)
         return j
 
     def lower_to(self, number: int, value: float) -> None:
         """A better value of a point."""
         self.values[number] = value
-        self.changes += 1
+        self.log.append(number)
 
-    def bound(self, belief: PointBelief, quality: FloatArray) -> float:
-        """The least bound by the points; infinity without any."""
-        found = np.inf
-        if not belief.cluster and self.count:
+    def bound(self, belief: PointBelief, quality: FloatArray, since: int) -> float:
+        """The least bound by the points that changed since entry `since` of the log; infinity without any."""
+        news = self.log[max(since, len(self.log) - LOOKED_BACK) :]
+        if not news:
+            return float("inf")
+        chosen = np.unique(np.array(news, dtype=np.int64))
+        found = float("inf")
+        if belief.joint is None:
             found = sawtooth(
                 belief.marginals, quality, self.points, self.values, self.base, self.groups,
-                self.count, self.product, SHRUNK,
+                chosen, self.product, SHRUNK,
             )  # fmt: skip
-        if belief.cluster or not self.product[: self.count].all():
-            found = min(found, self._by_pairs(belief, quality))
-        return found
-
-    def _by_pairs(self, belief: PointBelief, quality: FloatArray) -> float:
-        """The same where the belief or a point has a joint distribution."""
-        found = np.inf
-        looked = 0
-        for j in range(self.count - 1, -1, -1):
-            point = self.beliefs[j]
-            if not (belief.cluster or point.cluster):
-                continue
-            looked += 1
-            if looked > JOINT_POINTS:
-                break
-            phi = self.ratio(belief, point) * SHRUNK
-            if phi > 0.0:
-                rest = float((quality - phi * self.base[j]).max())
-                found = min(found, phi * float(self.values[j]) + rest)
-        return found
-
-    def ratio(self, belief: PointBelief, point: PointBelief) -> float:
-        """The least belief / point."""
+            if not self.joint_points:
+                return found
         space = self.space
-        levels = sorted({*belief.cluster, *point.cluster})
-        phi = 1.0
-        clustered = set(levels)
-        for k in space.pomdp.hidden:
-            level = space.pomdp.symbolic.now(k)
-            if level not in clustered:
-                begin = int(space.offset[level])
-                end = begin + space.pomdp.manager.sizes[level]
-                there = point.marginals[begin:end]
-                some = there > 0
-                phi *= float((belief.marginals[begin:end][some] / there[some]).min())
-                if phi == 0.0:
-                    return 0.0
-        a, b = belief.joint or space.unit, point.joint or space.unit
-        stamp = space.table.next_pass((len(levels) + 1) * len(a.levels) * len(b.levels))
-        order = np.array(levels, dtype=np.int64)
-        in_a = np.array([level in belief.cluster for level in levels], dtype=np.int64)
-        in_b = np.array([level in point.cluster for level in levels], dtype=np.int64)
-        least = pair_ratio(
-            0, a.roots[0], b.roots[0], order, in_a, in_b,
+        a, b = belief.joint or space.unit, self.joints
+        states = (len(space.levels) + 1) * len(a.levels) * len(b.levels)
+        stamp = space.table.next_pass(self.count * states)
+        joint = joint_sawtooth(
+            belief.marginals, quality, self.points, self.values, self.base,
+            chosen, belief.joint is not None, self.product, SHRUNK,
+            space.levels, space.clustered(belief), self.clustered, a.roots[0], self.joint_roots,
             a.levels, a.first, a.children, a.value, b.levels, b.first, b.children, b.value,
-            a.sizes, space.offset, belief.marginals, point.marginals,
-            space.table.keys, space.table.found, stamp,
+            a.sizes, space.offset, space.table.keys, space.table.found, stamp,
         )  # fmt: skip
-        return phi * least if least < np.inf else 0.0
+        return min(found, joint)
 
 
 class UpperBound:
     """The points at every y; `quality` [action] are diagrams over the whole state."""
 
-    def __init__(self, space: BeliefSpace, quality: list, size: float) -> None:  # type: ignore[type-arg]
+    def __init__(self, space: BeliefSpace, quality: list[Diagram], size: float) -> None:
         self.space, self.quality, self.size = space, quality, size
         self.sets: dict[Seen, PointSet] = {}
 
