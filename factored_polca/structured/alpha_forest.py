@@ -20,6 +20,7 @@ times the number of ways that levels of C which both skip may go.  Pairs are rem
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -270,28 +271,39 @@ class Forest:
         self.nodes = 0
         self.edges = 0
         self.roots: list[int] = []
-        self.starts: list[int] = []  # [i] the first node of the i-th diagram
+        self.starts: list[int] = []  # [i] the first of the nodes that were added with the i-th diagram
 
     def __len__(self) -> int:
         return len(self.roots)
 
     def add(self, diagram: Diagram) -> int:
         """Append a float diagram; its number."""
-        require((diagram,), FLOAT)
+        return self.add_all([diagram])
+
+    def add_all(self, diagrams: Sequence[Diagram]) -> int:
+        """Append float diagrams that share their nodes; the number of the first."""
+        require(diagrams, FLOAT)
         manager = self.manager
-        walk = Walk(diagram)
-        count = len(walk.nodes)
-        edges = int(manager.arity[walk.levels[~walk.is_leaf]].sum())
+        nodes = Walk(diagrams[0]).nodes
+        if len(diagrams) > 1:  # a child stands before its parents in the store
+            nodes = np.unique(np.concatenate([nodes, *(Walk(d).nodes for d in diagrams[1:])]))
+        manager.walks += 1  # which makes older walks number their nodes again
+        manager.pool[nodes + 1] = np.arange(len(nodes), dtype=np.int32)
+        levels = manager.pool[nodes]
+        count = len(nodes)
+        edges = int(manager.arity[levels[levels < manager.leaf_level]].sum())
         self._room(count, edges)
         begin, end = self.nodes, self.nodes + count
         export(
-            manager.pool, manager.arity, walk.nodes, begin, self.edges, self.levels[begin:end],
+            manager.pool, manager.arity, nodes, begin, self.edges, self.levels[begin:end],
             self.first[begin:end], self.children[self.edges :], self.value[begin:end],
         )  # fmt: skip
-        self.starts.append(begin)
         self.nodes, self.edges = end, self.edges + edges
-        self.roots.append(end - 1)
-        return len(self.roots) - 1
+        number = len(self.roots)
+        for diagram in diagrams:
+            self.starts.append(begin)
+            self.roots.append(begin + int(manager.pool[diagram.node + 1]))
+        return number
 
     def _room(self, nodes: int, edges: int) -> None:
         if self.nodes + nodes > len(self.levels):

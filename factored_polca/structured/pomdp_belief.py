@@ -21,8 +21,8 @@ taken for equal: `BELIEF_ERROR` bounds the relative error of all that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from typing import Final
 
@@ -32,7 +32,6 @@ import numpy.typing as npt
 from factored_polca.diagrams import (
     FLOAT,
     Diagram,
-    choose,
     move,
     node_count,
     restrict,
@@ -42,8 +41,10 @@ from factored_polca.diagrams.operations import Walk
 from factored_polca.models import LimitReached
 from factored_polca.structured.alpha_forest import Forest, Remembered
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Outcome, Seen, Step
+from factored_polca.structured.pomdp_point import KEPT_BITS, PointBelief, rounded_bits
+from factored_polca.structured.pomdp_tables import OutcomeTable, StepTable
 from factored_polca.symbolic.elimination import eliminate, joined
-from factored_polca.symbolic.factors import Factor
+from factored_polca.symbolic.factors import Factor, restricted
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -57,47 +58,9 @@ STARTS: Final = 10_000
 BELIEF_ERROR: Final = 1e-12
 """The L1 distance of a belief that was computed, and looked up, from the exact one that follows another."""
 
-_KEPT_BITS = np.uint64(8)
-
 
 class TooLarge(RuntimeError):
     """A belief, or what comes between two, has too many nodes."""
-
-
-@dataclass(frozen=True, eq=False)
-class PointBelief:
-    """A belief at one y.
-
-    `marginals` holds the distributions of the hidden features one after the other.  `cluster` are the levels
-    of the features whose joint distribution is `diagram`; it is empty for a product.
-    """
-
-    seen: Seen
-    marginals: FloatArray
-    cluster: tuple[int, ...] = ()
-    diagram: Diagram | None = None
-    joint: Forest | None = None
-    ways: FloatArray = field(default_factory=lambda: np.empty(0))
-
-    def key(self) -> tuple[object, ...]:
-        """Equal for beliefs that are taken for the same."""
-        parts: list[object] = [self.seen, _rounded(self.marginals).tobytes()]
-        if self.joint is not None:
-            f = self.joint
-            parts += [
-                self.cluster,
-                f.levels[: f.nodes].tobytes(),
-                f.children[: f.edges].tobytes(),
-                _rounded(f.value[: f.nodes]).tobytes(),
-            ]
-        return tuple(parts)
-
-
-def _rounded(values: FloatArray) -> npt.NDArray[np.uint64]:
-    """The first 45 bits of floats, rounded."""
-    bits = np.ascontiguousarray(values).view(np.uint64)
-    result: npt.NDArray[np.uint64] = (bits + np.uint64(128)) >> _KEPT_BITS
-    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,81 +70,6 @@ class Follow:
     probability: float
     belief: PointBelief
     exact: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _OutcomeTable:
-    """Where an outcome's expectations stand among those of its step, and what is connected in it.
-
-    `likelihood` is the number of L_o; the marginals at `entries` [e] are proportional to the expectations
-    `roots` [e]; `groups` [feature] is where the entries of each feature begin.
-    """
-
-    outcome: Outcome
-    likelihood: int
-    entries: IntArray
-    roots: IntArray
-    groups: IntArray
-    sizes: IntArray
-    scopes: tuple[frozenset[int], ...]  # of factors; 2 k now, 2 k + 1 next, by place among the hidden
-    product: dict[bytes, bool] = field(default_factory=dict)
-
-
-class StepTable:
-    """The expectations that an action at one y needs: first its reward, then those of its outcomes."""
-
-    def __init__(self, space: BeliefSpace, step: Step) -> None:
-        self.step = step
-        self.forest = Forest(space.pomdp.manager)
-        self.forest.add(step.reward)
-        self.outcomes = [self._table(space, outcome) for outcome in step.outcomes]
-
-    def _table(self, space: BeliefSpace, outcome: Outcome) -> _OutcomeTable:
-        pomdp, step = space.pomdp, self.step
-        symbolic = pomdp.symbolic
-        then = outcome.seen
-        chance = pomdp.eliminate(step, then, outcome.weight)
-        likelihood = self.forest.add(chance)
-        reads = set(support(chance))
-        told = set(support(outcome.weight))
-        entries: list[int] = []
-        roots: list[int] = []
-        groups: list[int] = []
-        sizes: list[int] = []
-        for k in pomdp.hidden:
-            count = len(pomdp.features[k].values)
-            if k in step.changed:
-                level = symbolic.next(k)
-                weights = step.weights[then, k]
-                parents = set().union(*(support(w) for w in weights))
-                apart = level not in told and not parents & reads
-                apart = apart and not any(p % 2 for p in parents)
-                for v in range(count):
-                    if apart:
-                        part = weights[v]
-                    else:
-                        here = pomdp.manager.indicator(level, [v])
-                        part = pomdp.eliminate(step, then, choose(here, outcome.weight, pomdp.zero))
-                    roots.append(self.forest.add(part))
-            elif symbolic.now(k) in reads:
-                for v in range(count):
-                    here = pomdp.manager.indicator(symbolic.now(k), [v])
-                    roots.append(self.forest.add(choose(here, chance, pomdp.zero)))
-            else:
-                continue
-            groups.append(len(entries))
-            sizes.append(count)
-            begin = int(space.offset[symbolic.now(k)])
-            entries += range(begin, begin + count)
-        scopes = [space.tokens(step, support(part)) for part in outcome.parts]
-        for k in step.changed:
-            levels = set().union(*(support(w) for w in step.weights[then, k]))
-            scopes.append(space.tokens(step, [*levels, symbolic.next(k)]))
-        return _OutcomeTable(
-            outcome, likelihood, np.array(entries, dtype=np.int64), np.array(roots, dtype=np.int64),
-            np.array(groups, dtype=np.int64),
-            np.array(sizes, dtype=np.int64), tuple(scopes),
-        )  # fmt: skip
 
 
 class BeliefSpace:
@@ -249,7 +137,7 @@ class BeliefSpace:
         return float(numbers[0]), found
 
     def _follow(
-        self, belief: PointBelief, step: Step, part: _OutcomeTable, numbers: FloatArray
+        self, belief: PointBelief, step: Step, part: OutcomeTable, numbers: FloatArray
     ) -> Follow | None:
         probability = float(numbers[part.likelihood])
         if not probability > 0.0:
@@ -279,7 +167,7 @@ class BeliefSpace:
         result: npt.NDArray[np.bool_] = np.add.reduceat((marginals > 0).astype(np.int64), self.groups) == 1
         return result
 
-    def _is_product(self, part: _OutcomeTable, before: FloatArray, after: FloatArray) -> bool:
+    def _is_product(self, part: OutcomeTable, before: FloatArray, after: FloatArray) -> bool:
         """Whether what follows a product is the product of its marginals."""
         known = self._known(before), self._known(after)
         key = np.concatenate(known).tobytes()
@@ -288,7 +176,7 @@ class BeliefSpace:
         return part.product[key]
 
     def _unconnected(
-        self, part: _OutcomeTable, before: npt.NDArray[np.bool_], after: npt.NDArray[np.bool_]
+        self, part: OutcomeTable, before: npt.NDArray[np.bool_], after: npt.NDArray[np.bool_]
     ) -> bool:
         groups: list[set[int]] = []
         for scope in part.scopes:
@@ -319,9 +207,7 @@ class BeliefSpace:
         if belief.diagram is not None:
             yield Factor(belief.diagram, frozenset(belief.cluster))
 
-    def _joint(
-        self, belief: PointBelief, step: Step, outcome: Outcome
-    ) -> tuple[float, PointBelief] | None:
+    def _joint(self, belief: PointBelief, step: Step, outcome: Outcome) -> tuple[float, PointBelief] | None:
         """The probability of an outcome and the belief that follows, by variable elimination."""
         pomdp, symbolic = self.pomdp, self.pomdp.symbolic
         live = list(self.factors(belief))
@@ -379,7 +265,7 @@ class BeliefSpace:
         factor.diagram.manager.safe_point()
         walk = Walk(factor.diagram)
         values = walk.leaf_payloads().view(np.float64) / total
-        rounded = (_rounded(values) << _KEPT_BITS).view(np.float64)
+        rounded = (rounded_bits(values) << KEPT_BITS).view(np.float64)
         return self._fits(walk.with_leaves(rounded, FLOAT))
 
     def _clustered(
@@ -391,6 +277,37 @@ class BeliefSpace:
         sizes = [size if level in scope else 1 for level, size in enumerate(self.pomdp.manager.sizes)]
         ways = np.concatenate([np.cumprod([1.0, *sizes]), [1.0]])
         return PointBelief(seen, marginals, cluster, diagram, joint, ways)
+
+    # -- beliefs that others track ---------------------------------------------------------------
+
+    def of_factors(self, factors: Sequence[Factor]) -> PointBelief:
+        """A belief given as factors over the present variables, those of observed features known.
+
+        Raises:
+            LimitReached: too many nodes.
+        """
+        known: dict[int, int] = {}
+        for i in self.pomdp.observed:
+            level = self.pomdp.symbolic.now(i)
+            owner = next(factor for factor in factors if level in factor.scope)
+            known[level] = int(owner.sums.marginal(level).argmax())
+        rest = [restricted(factor, known) for factor in factors]
+        seen = tuple(known[self.pomdp.symbolic.now(i)] for i in self.pomdp.observed)
+        try:
+            found = self._finished(seen, [factor for factor in rest if factor.scope])
+        except TooLarge:
+            raise LimitReached(
+                f"a belief has more than {self.cluster_nodes:,} nodes as one diagram", "belief"
+            ) from None
+        assert found is not None, "beliefs sum to 1"
+        return found[1]
+
+    def of_marginals(self, marginals: Mapping[str, FloatArray]) -> PointBelief:
+        """The product of the distributions of the features [name]."""
+        features = self.pomdp.features
+        seen = tuple(int(np.argmax(marginals[features[i].name])) for i in self.pomdp.observed)
+        parts = [np.asarray(marginals[features[k].name], dtype=np.float64) for k in self.pomdp.hidden]
+        return PointBelief(seen, np.concatenate([np.empty(0), *(part / part.sum() for part in parts)]))
 
     # -- the start -------------------------------------------------------------------------------
 
@@ -416,7 +333,11 @@ class BeliefSpace:
                 for v in range(len(initial[i].rows[0])):
                     now = {**fixed, symbolic.next(i): v}
                     part = pomdp.chance(initial[i], v)
-                    extend(rest, now, [restrict(d, {symbolic.next(i): v}) for d in [*live, restrict(part, fixed)]])
+                    extend(
+                        rest,
+                        now,
+                        [restrict(d, {symbolic.next(i): v}) for d in [*live, restrict(part, fixed)]],
+                    )
                 return
             if len(found) >= STARTS:
                 raise LimitReached(
@@ -427,7 +348,9 @@ class BeliefSpace:
                 )
             factors = [Factor(d, frozenset(support(d))) for d in live]
             for k in pomdp.hidden:
-                parts = [restrict(pomdp.chance(initial[k], v), fixed) for v in range(len(initial[k].rows[0]))]
+                parts = [
+                    restrict(pomdp.chance(initial[k], v), fixed) for v in range(len(initial[k].rows[0]))
+                ]
                 whole = pomdp.branch(symbolic.next(k), parts)
                 factors.append(Factor(whole, frozenset(support(whole)) | {symbolic.next(k)}))
             moved = [

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 
 from factored_polca.diagrams import FLOAT, Diagram, choose, node_count
 from factored_polca.structured.alpha_forest import Forest
-from factored_polca.structured.pomdp_belief import BeliefSpace, FloatArray, PointBelief
+from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen, Step
+from factored_polca.structured.pomdp_point import FloatArray, PointBelief
 from factored_polca.structured.rounding import round_leaves, round_to_size
 
 
@@ -27,7 +28,8 @@ from factored_polca.structured.rounding import round_leaves, round_to_size
 class Alpha:
     """An alpha-vector at the y `seen`: what a plan earns that begins with `action`.
 
-    `children` are those that it goes on with; a blind policy goes on with itself at the next y and has none.
+    `children` are those that it goes on with; a blind policy goes on with itself and has
+    none.
     """
 
     seen: Seen
@@ -138,4 +140,3 @@ def closure(alphas: Iterable[Alpha]) -> list[Alpha]:
             found[id(alpha)] = alpha
             waiting += alpha.children
     return list(found.values())
-

@@ -322,7 +322,7 @@ class FactoredPOMDP:
         return total
 
     def backup_error(self, step: Step, size: float) -> float:
-        """How far R + discount * regression may be off by rounding, for functions of absolute value `size`."""
+        """How far R + discount * regression may be off by rounding, for functions up to `size`."""
         return step.roundings * 2 * UNIT * (step.largest_reward + size)
 
     def shifted_by(self, diagram: Diagram, amount: float) -> Diagram:

@@ -10,8 +10,8 @@ until no such excess is left, and comes back making a point-based backup of both
 
 Actions are expanded when they are needed: at first an action's upper bound is its base bound, and while the
 best one has not been expanded it is.  An action some outcome of which leads to a *projected* belief
-(`pomdp_belief`) keeps its base bound; its outcomes still serve the lower bound.  Where the upper bound can't
-be improved for that reason, trials go by the lower bound every second time, and all actions that may be the
+(`pomdp_belief`) keeps its base bound; its outcomes still serve the lower bound.  Where the upper bound
+can't be improved for that reason, trials go by the lower bound every second time, and all actions that may be the
 best are expanded.
 """
 
@@ -23,14 +23,10 @@ from typing import Final
 
 import numpy as np
 
-from factored_polca.structured.pomdp_belief import (
-    BELIEF_ERROR,
-    BeliefSpace,
-    FloatArray,
-    PointBelief,
-)
+from factored_polca.structured.pomdp_belief import BELIEF_ERROR, BeliefSpace
 from factored_polca.structured.pomdp_lower import Alpha, LowerBound
 from factored_polca.structured.pomdp_model import UNIT, Seen, Step
+from factored_polca.structured.pomdp_point import FloatArray, PointBelief
 from factored_polca.structured.pomdp_upper import UpperBound
 
 DEEPEST: Final = 400
@@ -198,7 +194,10 @@ class Search:
     def backup_lower(self, node: Node) -> None:
         """A new alpha-vector for a node, where it is of use there."""
         best, chosen = -np.inf, -1
-        for action, expansion in node.expanded.items():
+        for action in sorted(node.expanded, key=lambda a: -node.uppers[a]):
+            if node.uppers[action] <= best:
+                break
+            expansion = node.expanded[action]
             value = 0.0
             for chance, child in zip(expansion.chances, expansion.children, strict=True):
                 if child is not None:
@@ -271,7 +270,7 @@ class Search:
             self.backup_upper(node)
 
     def _by_lower(self, node: Node, action: int) -> int:
-        """The action of a trial where the upper bound does not tell: every second time the best known one."""
+        """An action where the upper bound does not tell: every second time the best known one."""
         for other in range(len(node.uppers)):
             if node.uppers[other] > node.lower:
                 self.expand(node, other)

@@ -15,16 +15,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
-from factored_polca.diagrams import FLOAT, Aborted, Diagram, MemoryLimit, choose, node_count
+from factored_polca.diagrams import Aborted, Diagram, MemoryLimit, node_count
 from factored_polca.models import ModelError
 from factored_polca.solvers.evaluation import TimeIsUp
 from factored_polca.solvers.interrupts import interrupts_at_polls
 from factored_polca.solvers.pomdp_result import Bounds, Demand
 from factored_polca.solvers.result import Guarantee, Status
-from factored_polca.structured.pomdp_belief import BeliefSpace, PointBelief
+from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_bounds import FirstBounds, Sizes
 from factored_polca.structured.pomdp_lower import Alpha, AlphaSet, LowerBound, closure
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen
+from factored_polca.structured.pomdp_point import PointBelief
 from factored_polca.structured.pomdp_search import SHARE, Search, TooManyBeliefs
 from factored_polca.structured.pomdp_upper import UpperBound
 from factored_polca.symbolic import SymbolicModel
@@ -34,6 +35,9 @@ METHOD: Final = "point-based value iteration on diagrams"
 NODE_LIMIT: Final = 20_000
 """Nodes of an alpha-vector or a bound, beyond which its leaves are merged."""
 
+ASKED_NODES: Final = 1_000_000
+"""Nodes of a belief at which a policy is asked."""
+
 BELIEF_LIMIT: Final = 1_000_000
 """Beliefs that may be explored."""
 
@@ -42,7 +46,7 @@ QMDP_SECONDS: Final = 60.0
 """How long the first bounds may take, where that is less than their share of the time given."""
 
 MERGED: Final = 0.1
-"""Leaves are merged within this share of gap * (1 - discount), so that merging costs that share of the gap."""
+"""Leaves are merged within this share of gap * (1 - discount), which is what merging then costs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class AlphaDiagrams:
     @cached_property
     def space(self) -> BeliefSpace:
         """Beliefs to ask it at."""
-        return BeliefSpace(FactoredPOMDP(self.symbolic))
+        return BeliefSpace(FactoredPOMDP(self.symbolic), cluster_nodes=ASKED_NODES)
 
     @property
     def vectors(self) -> int:
@@ -130,9 +134,7 @@ class SymbolicSolution:
 class _Run:
     """The state of a run: what is there when it is stopped."""
 
-    def __init__(
-        self, symbolic: SymbolicModel, demand: Demand, node_limit: int, belief_limit: int
-    ) -> None:
+    def __init__(self, symbolic: SymbolicModel, demand: Demand, node_limit: int, belief_limit: int) -> None:
         self.began = time.monotonic()
         self.demand = demand
         self.pomdp = FactoredPOMDP(symbolic)
@@ -141,9 +143,7 @@ class _Run:
         self.sizes = Sizes(node_limit, width)
         self.belief_limit = belief_limit
         self.first = FirstBounds(self.pomdp, self.sizes, demand.poll)
-        terminal = symbolic.terminal
-        floor = self.pomdp.manager.constant(self.first.floor, FLOAT)
-        self.blind: list[tuple[int, Diagram]] = [(0, choose(terminal, self.pomdp.zero, floor))]
+        self.blind: list[tuple[int, Diagram]] = [(0, self.first.constant(self.first.floor))]
         self.bounds = (self.first.floor, self.first.ceiling)
         self.search: Search | None = None
         self.trials = 0
@@ -163,31 +163,14 @@ class _Run:
     def first_bounds(self) -> None:
         """Blind policies and QMDP."""
         left = self.demand.seconds_left
-        now = time.monotonic()
-        try:
-            self.blind = self.first.blind(now + min(BLIND_SECONDS, left / 10)) or self.blind
-        except MemoryLimit:
-            self.notes.append("memory ended the blind policies early")
-        now = time.monotonic()
-        ceiling = choose(
-            self.pomdp.symbolic.terminal,
-            self.pomdp.zero,
-            self.pomdp.manager.constant(self.first.ceiling, FLOAT),
-        )
-        quality = [ceiling]
-        try:
-            quality = self.first.qmdp(now + min(QMDP_SECONDS, left / 4))
-        except MemoryLimit:
-            self.notes.append("memory ended the bound of the observed state (QMDP) early")
-        if len(quality) < self.pomdp.actions:
-            quality = quality * self.pomdp.actions
+        blind = self.first.blind(time.monotonic() + min(BLIND_SECONDS, left / 10))
+        self.blind = blind or self.blind
+        quality = self.first.qmdp(time.monotonic() + min(QMDP_SECONDS, left / 4))
         lower = LowerBound(
             self.space, self.blind, self.first.size, nodes=self.sizes.nodes, width=self.sizes.width
         )
         upper = UpperBound(self.space, quality, self.first.size)
-        search = Search(
-            self.space, lower, upper, poll=self.demand.poll, belief_limit=self.belief_limit
-        )
+        search = Search(self.space, lower, upper, poll=self.demand.poll, belief_limit=self.belief_limit)
         search.roots = [(p, search.node(belief)) for p, belief in self.space.starts()]
         self.search = search
         self.note_bounds()

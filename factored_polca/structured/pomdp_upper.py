@@ -17,8 +17,9 @@ import numpy.typing as npt
 from factored_polca.diagrams import Diagram
 from factored_polca.diagrams.jit import kernel
 from factored_polca.structured.alpha_forest import Forest, pair_ratio
-from factored_polca.structured.pomdp_belief import BeliefSpace, PointBelief
+from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_model import Seen
+from factored_polca.structured.pomdp_point import PointBelief
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -139,7 +140,7 @@ class PointSet:
         self.log.append(number)
 
     def bound(self, belief: PointBelief, quality: FloatArray, since: int) -> float:
-        """The least bound by the points that changed since entry `since` of the log; infinity without any."""
+        """The least bound by the points in the log from `since` on; infinity without any."""
         news = self.log[max(since, len(self.log) - LOOKED_BACK) :]
         if not news:
             return float("inf")
@@ -177,7 +178,6 @@ class UpperBound:
         """The points at one y."""
         if seen not in self.sets:
             forest = Forest(self.space.pomdp.manager)
-            for diagram in self.quality:
-                forest.add(self.space.pomdp.at(seen, diagram))
+            forest.add_all([self.space.pomdp.at(seen, diagram) for diagram in self.quality])
             self.sets[seen] = PointSet(self.space, forest)
         return self.sets[seen]
