@@ -157,8 +157,8 @@ class FirstBounds:
                     lifted = self.shift(least - 64 * UNIT * self.size)
                     alpha = self.pomdp.shifted_by(alpha, max(0.0, lifted))
                     after = self.pomdp.shifted_by(after, max(0.0, lifted * self.pomdp.discount))
-                alpha = apply("maximum", alpha, self.merged(after, width * 0.01, "down"))
-                if most - (0 if self.ends else least) <= self.sizes.width:
+                before, alpha = alpha, apply("maximum", alpha, self.merged(after, width * 0.01, "down"))
+                if alpha == before or most - (0 if self.ends else least) <= self.sizes.width:
                     break
         except (Aborted, MemoryLimit):
             self.poll()

@@ -11,8 +11,8 @@ until no such excess is left, and comes back making a point-based backup of both
 Actions are expanded when they are needed: at first an action's upper bound is its base bound, and while the
 best one has not been expanded it is.  An action some outcome of which leads to a *projected* belief
 (`pomdp_belief`) keeps its base bound; its outcomes still serve the lower bound.  Where the upper bound
-can't be improved for that reason, trials go by the lower bound every second time, and all actions that may be the
-best are expanded.
+can't be improved for that reason, trials go by the lower bound every second time, and all actions that may
+be the best are expanded.
 """
 
 from __future__ import annotations
