@@ -297,18 +297,18 @@ def test_a_policy_says_at_least_the_lower_bound_of_itself() -> None:
 
 def test_too_many_joint_observations_name_the_channels() -> None:
     x = boolean("x")
-    channels = [Observation(f"o{i}", ["none", "a", "b", "c", "d"]) for i in range(5)]
+    channels = [Observation(f"o{i}", ["none", "a", "b", "c", "d"]) for i in range(6)]
     chances = {"a": Fraction(1, 10), "b": Fraction(2, 10), "c": Fraction(3, 10), "d": Fraction(4, 10)}
     others = [
         {"a": Fraction(i, 50), "b": Fraction(3, 10), "c": Fraction(2, 10), "d": Fraction(25 - i, 50)}
-        for i in range(1, 6)
+        for i in range(1, 7)
     ]
     tells = [conditional(x.next, lottery(chances), lottery(other)) for other in others]
     model = Model(
         "noisy", [x], [Action("look", {}, senses=dict(zip(channels, tells, strict=True)))],
         rewards=[1], discount=Fraction(1, 2), observability="partial", observations=channels,
     )  # fmt: skip
-    with pytest.raises(LimitReached, match=r"'look'.*o0 \(5 values\).*o4 \(5 values\)"):
+    with pytest.raises(LimitReached, match=r"'look'.*o0 \(5 values\).*o5 \(5 values\)"):
         solve_symbolic(compile_model(model), Demand(1e-3))
 
 
