@@ -151,14 +151,19 @@ class BeliefSpace:
             after[part.entries] = fresh / np.repeat(totals, part.sizes)
         then = part.outcome.seen
         projected = PointBelief(then, after)
-        if not belief.cluster and self._is_product(part, belief.marginals, after):
+        known = np.concatenate([self._known(belief.marginals), self._known(after)]).tobytes()
+        if not belief.cluster and self._is_product(part, known):
             return Follow(probability, projected, True)
+        exact = None
         try:
-            exact = self._joint(belief, step, part.outcome)
+            if belief.cluster or known not in part.crowded:
+                exact = self._joint(belief, step, part.outcome)
+                return None if exact is None else Follow(exact[0], exact[1], True)
         except TooLarge:
-            self.projections += 1
-            return Follow(probability, projected, False)
-        return None if exact is None else Follow(exact[0], exact[1], True)
+            if not belief.cluster:
+                part.crowded.add(known)
+        self.projections += 1
+        return Follow(probability, projected, False)
 
     def _known(self, marginals: FloatArray) -> npt.NDArray[np.bool_]:
         """Whether each hidden feature has one value."""
@@ -167,13 +172,12 @@ class BeliefSpace:
         result: npt.NDArray[np.bool_] = np.add.reduceat((marginals > 0).astype(np.int64), self.groups) == 1
         return result
 
-    def _is_product(self, part: OutcomeTable, before: FloatArray, after: FloatArray) -> bool:
-        """Whether what follows a product is the product of its marginals."""
-        known = self._known(before), self._known(after)
-        key = np.concatenate(known).tobytes()
-        if key not in part.product:
-            part.product[key] = self._unconnected(part, *known)
-        return part.product[key]
+    def _is_product(self, part: OutcomeTable, known: bytes) -> bool:
+        """Whether what follows a product is the product of its marginals; `known` features now and next."""
+        if known not in part.product:
+            before, after = np.frombuffer(known, dtype=np.bool_).reshape(2, -1)
+            part.product[known] = self._unconnected(part, before, after)
+        return part.product[known]
 
     def _unconnected(
         self, part: OutcomeTable, before: npt.NDArray[np.bool_], after: npt.NDArray[np.bool_]

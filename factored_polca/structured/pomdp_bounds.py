@@ -74,8 +74,8 @@ class FirstBounds:
         slack = 64 * UNIT * self.size
         self.floor = least / (1 - pomdp.discount) - slack
         self.ceiling = most / (1 - pomdp.discount) + slack
-        self._error = [self._rounding(a) for a in range(pomdp.actions)]
-        self._kinds = self._equal_dynamics()
+        self.errors = [self._rounding(a) for a in range(pomdp.actions)]
+        self.kinds = self._equal_dynamics()
 
     def _rounding(self, action: int) -> float:
         compiled = self.pomdp.symbolic.actions[action]
@@ -105,11 +105,11 @@ class FirstBounds:
     def backed_up(self, action: int, value: Diagram, regressed: dict[int, Diagram], sign: float) -> Diagram:
         """R_a + discount * R_a[V], moved by the rounding error to the side of `sign`, 0 where terminal."""
         pomdp = self.pomdp
-        kind = self._kinds[action]
+        kind = self.kinds[action]
         if kind not in regressed:
             after = pomdp.numbers.regress(action, value)
             regressed[kind] = after * pomdp.manager.constant(pomdp.discount, FLOAT)
-        error = pomdp.manager.constant(sign * self._error[action], FLOAT)
+        error = pomdp.manager.constant(sign * self.errors[action], FLOAT)
         total = pomdp.reward(action) + regressed[kind] + error
         return choose(pomdp.symbolic.terminal, pomdp.zero, total)
 
@@ -134,7 +134,7 @@ class FirstBounds:
         for action in range(pomdp.actions):
             if found and time.monotonic() > deadline:
                 break
-            twins = (a for a, _ in found if self._kinds[a] == self._kinds[action])
+            twins = (a for a, _ in found if self.kinds[a] == self.kinds[action])
             if any(pomdp.reward(a) == pomdp.reward(action) for a in twins):
                 continue
             alpha = self.constant(self.floor)

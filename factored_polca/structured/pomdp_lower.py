@@ -15,13 +15,29 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import prod
+from typing import Final
 
-from factored_polca.diagrams import FLOAT, Diagram, choose, node_count
+import numpy as np
+
+from factored_polca.diagrams import FLOAT, Diagram, choose, node_count, support
 from factored_polca.structured.alpha_forest import Forest
 from factored_polca.structured.pomdp_belief import BeliefSpace
+from factored_polca.structured.pomdp_cells import (
+    CELLS,
+    Table,
+    TooManyCells,
+    eliminate,
+    merged_diagram,
+    table_of,
+)
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen, Step
 from factored_polca.structured.pomdp_point import FloatArray, PointBelief
 from factored_polca.structured.rounding import round_leaves, round_to_size
+
+FEWEST_CELLS: Final = 1_024
+CROWDED: Final = 20
+"""Tables take the place of diagrams with a node for fewer than so many cells; of at least so many cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +103,11 @@ class LowerBound:
         self.sets: dict[Seen, AlphaSet] = {}
         self.loss = 0.0  # the most that merging has taken off in a backup
         self._dead: dict[Seen, Diagram] = {}
+        levels = [space.pomdp.symbolic.now(k) for k in space.pomdp.hidden]
+        self.axes = tuple(sorted(levels))
+        self.cells = prod(space.pomdp.manager.sizes[level] for level in levels)
+        self._tables: dict[tuple[Seen, int], tuple[list[Table], dict[Seen, dict[int, Table]]]] = {}
+        self._no_cells = False
 
     def at(self, seen: Seen) -> AlphaSet:
         """The alpha-vectors at one y; at first those of the blind policies."""
@@ -116,18 +137,73 @@ class LowerBound:
 
     def backup(self, step: Step, chosen: Sequence[Alpha]) -> Alpha:
         """The alpha-vector of an action and of one alpha-vector for each of its outcomes."""
+        error = self.pomdp.backup_error(step, self.size)
+        distinct = {id(alpha): alpha for alpha in chosen}
+        found = self.by_cells(step, chosen, error) if self._crowded(distinct.values()) else None
+        if found is None:
+            found = self.by_diagrams(step, chosen, error)
+        diagram, loss = found
+        self.loss = max(self.loss, loss)
+        return Alpha(step.seen, step.action, diagram, tuple(distinct.values()))
+
+    def by_diagrams(self, step: Step, chosen: Sequence[Alpha], error: float) -> tuple[Diagram, float]:
+        """The backup less `error`, leaves merged, on diagrams; and what merging has taken off."""
         pomdp = self.pomdp
         after = pomdp.regress(step, [alpha.diagram for alpha in chosen])
         total = step.reward + after * pomdp.manager.constant(pomdp.discount, FLOAT)
-        error = pomdp.backup_error(step, self.size)
-        total = pomdp.shifted_by(total, -error)
-        total = choose(self.dead(step.seen), pomdp.zero, total)
+        total = choose(self.dead(step.seen), pomdp.zero, pomdp.shifted_by(total, -error))
         rounded = round_leaves(total, self.width, "down")
         if node_count(rounded.diagram) > self.nodes:
             rounded = round_to_size(total, nodes=self.nodes, width=self.width, direction="down")
-        self.loss = max(self.loss, rounded.error)
-        distinct = {id(alpha): alpha for alpha in chosen}
-        return Alpha(step.seen, step.action, rounded.diagram, tuple(distinct.values()))
+        return rounded.diagram, rounded.error
+
+    # -- on tables -------------------------------------------------------------------------------
+
+    def _crowded(self, alphas: Iterable[Alpha]) -> bool:
+        """Whether diagrams have so many nodes that tables are better."""
+        if not FEWEST_CELLS <= self.cells <= CELLS or self._no_cells:
+            return False
+        return any(node_count(alpha.diagram) * CROWDED > self.cells for alpha in alphas)
+
+    def by_cells(self, step: Step, chosen: Sequence[Alpha], error: float) -> tuple[Diagram, float] | None:
+        """The same on tables; None where one on the way is too large."""
+        pomdp, symbolic = self.pomdp, self.pomdp.symbolic
+        key = (step.seen, step.action)
+        moved = {symbolic.now(k): symbolic.next(k) for k in step.changed}
+        try:
+            if key not in self._tables:
+                self._tables[key] = self._step_tables(step)
+            outcomes, weights = self._tables[key]
+            sums: dict[Seen, Table] = {}
+            for outcome, weight, alpha in zip(step.outcomes, outcomes, chosen, strict=True):
+                part = weight * table_of(alpha.diagram, self.axes).moved(moved)
+                before = sums.get(outcome.seen)
+                sums[outcome.seen] = part if before is None else before + part
+            total = table_of(step.reward, self.axes)
+            synchronic = symbolic.actions[step.action].synchronic
+            for then, function in sums.items():
+                after = eliminate(function, weights[then], synchronic)
+                total = total + Table(after.axes, pomdp.discount * after.values)
+        except TooManyCells:
+            self._no_cells = True
+            return None
+        shape = [pomdp.manager.sizes[axis] for axis in self.axes]
+        live = table_of(pomdp.at(step.seen, pomdp.live), self.axes).values > 0
+        values = np.where(live, np.broadcast_to(total.over(self.axes), shape) - error, 0.0)
+        return merged_diagram(pomdp.manager, Table(self.axes, values), self.width, self.nodes, "down")
+
+    def _step_tables(self, step: Step) -> tuple[list[Table], dict[Seen, dict[int, Table]]]:
+        """W_o for each outcome, and the distributions of the changed features at each y'."""
+        pomdp, symbolic = self.pomdp, self.pomdp.symbolic
+        weights: dict[Seen, dict[int, Table]] = {}
+        for (then, k), parts in step.weights.items():
+            level = symbolic.next(k)
+            whole = pomdp.branch(level, parts)
+            table = table_of(whole, sorted({*support(whole), level}))
+            weights.setdefault(then, {})[level] = table
+        for outcome in step.outcomes:
+            weights.setdefault(outcome.seen, {})
+        return [table_of(outcome.weight) for outcome in step.outcomes], weights
 
 
 def closure(alphas: Iterable[Alpha]) -> list[Alpha]:

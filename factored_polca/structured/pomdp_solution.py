@@ -23,6 +23,7 @@ from factored_polca.solvers.pomdp_result import Bounds, Demand
 from factored_polca.solvers.result import Guarantee, Status
 from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_bounds import FirstBounds, Sizes
+from factored_polca.structured.pomdp_cell_bounds import first_bounds
 from factored_polca.structured.pomdp_lower import Alpha, AlphaSet, LowerBound, closure
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen
 from factored_polca.structured.pomdp_point import PointBelief
@@ -33,7 +34,10 @@ from factored_polca.symbolic import SymbolicModel
 METHOD: Final = "point-based value iteration on diagrams"
 
 NODE_LIMIT: Final = 20_000
-"""Nodes of an alpha-vector or a bound, beyond which its leaves are merged."""
+"""Nodes of a bound over all states, beyond which its leaves are merged."""
+
+ALPHA_NODES: Final = 4_000
+"""The same of an alpha-vector at one y."""
 
 ASKED_NODES: Final = 1_000_000
 """Nodes of a belief at which a policy is asked."""
@@ -140,7 +144,8 @@ class _Run:
         self.pomdp = FactoredPOMDP(symbolic)
         self.space = BeliefSpace(self.pomdp)
         width = demand.gap * (1 - self.pomdp.discount) * MERGED
-        self.sizes = Sizes(node_limit, width)
+        self.alpha_nodes = min(node_limit, ALPHA_NODES)
+        self.sizes = Sizes(node_limit if self.pomdp.observed else self.alpha_nodes, width)
         self.belief_limit = belief_limit
         self.first = FirstBounds(self.pomdp, self.sizes, demand.poll)
         self.blind: list[tuple[int, Diagram]] = [(0, self.first.constant(self.first.floor))]
@@ -163,11 +168,18 @@ class _Run:
     def first_bounds(self) -> None:
         """Blind policies and QMDP."""
         left = self.demand.seconds_left
-        blind = self.first.blind(time.monotonic() + min(BLIND_SECONDS, left / 10))
+        blind, quality, tables = first_bounds(
+            self.first, min(BLIND_SECONDS, left / 10), min(QMDP_SECONDS, left / 4)
+        )
         self.blind = blind or self.blind
-        quality = self.first.qmdp(time.monotonic() + min(QMDP_SECONDS, left / 4))
+        if tables:
+            self.notes.append("the first bounds were found on tables of all states")
         lower = LowerBound(
-            self.space, self.blind, self.first.size, nodes=self.sizes.nodes, width=self.sizes.width
+            self.space,
+            self.blind,
+            self.first.size,
+            nodes=min(self.sizes.nodes, ALPHA_NODES),
+            width=self.sizes.width,
         )
         upper = UpperBound(self.space, quality, self.first.size)
         search = Search(self.space, lower, upper, poll=self.demand.poll, belief_limit=self.belief_limit)
@@ -291,7 +303,7 @@ def _finished(run: _Run, status: Status) -> SymbolicSolution:
     loss = 0.0 if search is None else search.lower.loss
     if loss > 2 * run.sizes.width:
         notes.append(
-            f"alpha-vectors were merged down to {run.sizes.nodes:,} nodes, at up to {loss:.2g} a backup"
+            f"alpha-vectors were merged down to {run.alpha_nodes:,} nodes, at up to {loss:.2g} a backup"
         )
     text = (
         "the optimal value lies between the bounds, and the policy earns at least the lower one; "

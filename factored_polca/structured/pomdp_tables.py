@@ -37,6 +37,7 @@ class OutcomeTable:
     sizes: IntArray
     scopes: tuple[frozenset[int], ...]  # of factors; 2 k now, 2 k + 1 next, by place among the hidden
     product: dict[bytes, bool] = field(default_factory=dict)
+    crowded: set[bytes] = field(default_factory=set)  # where the joint distribution was too large
 
 
 class StepTable:

@@ -14,17 +14,21 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Diagram, node_count
 from factored_polca.diagrams.jit import kernel
 from factored_polca.structured.alpha_forest import Forest, pair_ratio
 from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_model import Seen
 from factored_polca.structured.pomdp_point import PointBelief
+from factored_polca.structured.rounding import round_to_size
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Int32Array = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]
+
+BASE_NODES = 2_000
+"""Nodes of a base bound at one y."""
 
 SHRUNK = 1 - 1e-12
 """What a computed ratio is multiplied by, to be below the exact one."""
@@ -178,6 +182,13 @@ class UpperBound:
         """The points at one y."""
         if seen not in self.sets:
             forest = Forest(self.space.pomdp.manager)
-            forest.add_all([self.space.pomdp.at(seen, diagram) for diagram in self.quality])
+            slices = [self.space.pomdp.at(seen, diagram) for diagram in self.quality]
+            forest.add_all([self._small(diagram) for diagram in slices])
             self.sets[seen] = PointSet(self.space, forest)
         return self.sets[seen]
+
+    def _small(self, diagram: Diagram) -> Diagram:
+        """A base bound at one y with leaves merged upwards where it has too many nodes."""
+        if node_count(diagram) <= BASE_NODES:
+            return diagram
+        return round_to_size(diagram, nodes=BASE_NODES, direction="up").diagram
