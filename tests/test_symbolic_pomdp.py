@@ -442,7 +442,7 @@ def test_a_table_is_the_diagram_that_it_came_from(seed: int) -> None:
         assert at(diagram, dict(zip(axes, cell, strict=True))) == values[cell]
     for direction, sign in (("down", -1.0), ("up", 1.0)):
         merged, error = merged_diagram(manager, Table(axes, random.random(sizes)), 0.0, 5, direction)
-        assert node_count(merged) <= 5 + len(sizes)
+        assert node_count(merged) <= 5
         assert 0 <= error <= 1
         noisy = Table(axes, random.random(sizes))
         merged, error = merged_diagram(manager, noisy, 0.1, 50, direction)
@@ -454,7 +454,7 @@ def test_a_table_is_the_diagram_that_it_came_from(seed: int) -> None:
 def test_sixteen_machines_in_a_ring_get_bounds() -> None:
     """2^16 states, of which the beliefs are projected: the bounds hold what ever they are."""
     model = library.load("network", {"size": 16}).model
-    found = solve_symbolic(compile_model(model), Demand(1.0, deadline=time.monotonic() + 15))
+    found = solve_symbolic(compile_model(model), Demand(1.0, deadline=time.monotonic() + 40))
     assert found.status == "time limit"
     # never to act earns what is up; nobody earns more than 17 a step
     assert 0 < found.lower < found.upper <= 17 / (1 - 0.95) + 1e-6

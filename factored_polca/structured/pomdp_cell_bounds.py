@@ -6,6 +6,7 @@ The iterations are the same; only at the end do the tables become diagrams, thei
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from math import prod
 
 import numpy as np
@@ -126,7 +127,11 @@ class CellBounds:
             if time.monotonic() > deadline:
                 break
             value = lower
-        return [self._diagram(q, "up") for q in quality]
+        made: list[Diagram] = []
+        for action in actions:
+            twin = next((a for a in range(action) if np.array_equal(quality[a], quality[action])), None)
+            made.append(self._diagram(quality[action], "up") if twin is None else made[twin])
+        return made
 
     def _diagram(self, values: FloatArray, direction: str) -> Diagram:
         sizes = self.first.sizes
@@ -138,13 +143,16 @@ class CellBounds:
 
 
 def first_bounds(
-    first: FirstBounds, blind_seconds: float, qmdp_seconds: float
-) -> tuple[list[tuple[int, Diagram]], list[Diagram], bool]:
-    """Blind alpha-vectors, Q_a for each action, and whether tables were used."""
+    first: FirstBounds,
+    blind_seconds: float,
+    qmdp_seconds: float,
+    keep: Callable[[list[tuple[int, Diagram]]], None],
+) -> tuple[list[Diagram], bool]:
+    """Q_a for each action, and whether tables were used; `keep` is given the blind alpha-vectors before."""
     try:
         cells = CellBounds(first)
-        blind = cells.blind(time.monotonic() + blind_seconds)
-        return blind, cells.qmdp(time.monotonic() + qmdp_seconds), True
+        keep(cells.blind(time.monotonic() + blind_seconds))
+        return cells.qmdp(time.monotonic() + qmdp_seconds), True
     except TooManyCells:
-        blind = first.blind(time.monotonic() + blind_seconds)
-        return blind, first.qmdp(time.monotonic() + qmdp_seconds), False
+        keep(first.blind(time.monotonic() + blind_seconds))
+        return first.qmdp(time.monotonic() + qmdp_seconds), False

@@ -75,13 +75,14 @@ class Table:
         for v in range(sizes[level]):
             part = self._at(level, v).over(axes) * weight._at(level, v).over(axes)
             total = total + part
-        return Table(axes, total)
+        return Table(axes, np.asarray(total, dtype=np.float64))
 
     def _at(self, level: int, value: int) -> Table:
         if level not in self.axes:
             return self
         place = self.axes.index(level)
-        return Table((*self.axes[:place], *self.axes[place + 1 :]), self.values.take(value, axis=place))
+        values: FloatArray = np.asarray(self.values.take(value, axis=place))
+        return Table((*self.axes[:place], *self.axes[place + 1 :]), values)
 
 
 @kernel
@@ -207,11 +208,12 @@ def merged_diagram(
     manager: Manager, table: Table, width: float, nodes: int, direction: Direction
 ) -> tuple[Diagram, float]:
     """A table as a diagram of at most `nodes` nodes, leaves merged to one side, and the largest error."""
-    leaves = table.values.size
+    distinct = len(np.unique(table.values))
+    leaves = distinct if distinct <= nodes else max(1, nodes // 8)
     while True:
         values = merged_cells(table.values, width, leaves, direction)
         found = diagram_of(manager, Table(table.axes, values))
         count = node_count(found)
-        if count <= nodes or leaves == 2:
+        if count <= nodes or leaves == 1:
             return found, float(np.abs(values - table.values).max(initial=0.0))
-        leaves = max(2, min(leaves * 9 * nodes // (10 * count), nodes // 8))
+        leaves = max(1, min(leaves * 9 * nodes // (10 * count), nodes // 8))

@@ -21,7 +21,7 @@ from factored_polca.solvers.evaluation import TimeIsUp
 from factored_polca.solvers.interrupts import interrupts_at_polls
 from factored_polca.solvers.pomdp_result import Bounds, Demand
 from factored_polca.solvers.result import Guarantee, Status
-from factored_polca.structured.pomdp_belief import BeliefSpace
+from factored_polca.structured.pomdp_belief import BELIEF_ERROR, BeliefSpace
 from factored_polca.structured.pomdp_bounds import FirstBounds, Sizes
 from factored_polca.structured.pomdp_cell_bounds import first_bounds
 from factored_polca.structured.pomdp_lower import Alpha, AlphaSet, LowerBound, closure
@@ -168,24 +168,37 @@ class _Run:
     def first_bounds(self) -> None:
         """Blind policies and QMDP."""
         left = self.demand.seconds_left
-        blind, quality, tables = first_bounds(
-            self.first, min(BLIND_SECONDS, left / 10), min(QMDP_SECONDS, left / 4)
+        starts = self.space.starts()
+
+        def keep(blind: list[tuple[int, Diagram]]) -> None:
+            self.blind = blind or self.blind
+            lower = self._lower()
+            error = 4 * self.first.size * BELIEF_ERROR
+            value = sum(p * float(lower.values(belief).max()) for p, belief in starts) - error
+            self.bounds = (max(self.bounds[0], value), self.bounds[1])
+
+        quality, tables = first_bounds(
+            self.first, min(BLIND_SECONDS, left / 10), min(QMDP_SECONDS, left / 4), keep
         )
-        self.blind = blind or self.blind
         if tables:
             self.notes.append("the first bounds were found on tables of all states")
-        lower = LowerBound(
+        upper = UpperBound(self.space, quality, self.first.size)
+        search = Search(
+            self.space, self._lower(), upper, poll=self.demand.poll, belief_limit=self.belief_limit
+        )
+        search.roots = [(p, search.node(belief)) for p, belief in starts]
+        self.search = search
+        self.note_bounds()
+
+    def _lower(self) -> LowerBound:
+        """The alpha-vectors of blind policies."""
+        return LowerBound(
             self.space,
             self.blind,
             self.first.size,
-            nodes=min(self.sizes.nodes, ALPHA_NODES),
+            nodes=self.alpha_nodes,
             width=self.sizes.width,
         )
-        upper = UpperBound(self.space, quality, self.first.size)
-        search = Search(self.space, lower, upper, poll=self.demand.poll, belief_limit=self.belief_limit)
-        search.roots = [(p, search.node(belief)) for p, belief in self.space.starts()]
-        self.search = search
-        self.note_bounds()
 
     def improve(self) -> Status:
         """Trials until the gap, or the limit of iterations, is reached."""
