@@ -44,6 +44,8 @@ SOLVE_NOTES = """solvers:
   witness   the same with --horizon, by another algorithm: a cross-check
   sarsop, hsvi, pbvi, perseus   point-based: a policy, and bounds on the optimum
   qmdp, fib, blind, amdp        quick and coarse; for qmdp, fib and amdp simulate tells what they earn
+  symbolic  partially observed models, on diagrams: no state is listed; auto takes it for models with too
+            many states to list
   vi, pi, mpi                   fully observed models: value, policy, modified policy iteration
   structured                    fully observed models, without listing states: value iteration on diagrams
   package.module:Name           any solver that can be called as factored_polca.solvers.protocol says;

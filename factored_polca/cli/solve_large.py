@@ -178,8 +178,8 @@ def over_blocks(
     """
     from factored_polca.cli.solve import MDP_EPSILON
     from factored_polca.diagrams import MemoryLimit
-    from factored_polca.hierarchy.options import STRUCTURED_BLOCKS
     from factored_polca.hierarchy.evaluation import describe_block, expectation
+    from factored_polca.hierarchy.options import STRUCTURED_BLOCKS
     from factored_polca.minimisation import reduce
     from factored_polca.solvers import solve_mdp
 
