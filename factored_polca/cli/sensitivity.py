@@ -255,8 +255,8 @@ def show(data: dict[str, Any], found: Sensitivity, output: Output) -> None:
         table.add_row("minimised once in", seconds(data["minimise_seconds"]))
         table.add_row(
             "for each setting",
-            f"{data['instantiate_microseconds']:,.0f} us to set, "
-            f"{data['solve_microseconds']:,.0f} us to solve",
+            f"{data['instantiate_microseconds'] / 1000:.3f} ms to set, "
+            f"{data['solve_microseconds'] / 1000:.3f} ms to solve",
         )
     output.table(table)
     columns = dict.fromkeys(found.parameters, "right") | {"value": "right"}
@@ -264,9 +264,8 @@ def show(data: dict[str, Any], found: Sensitivity, output: Output) -> None:
         columns["policy"] = "right"
     points = make_table("some of the settings", columns)
     count = len(found.points)
-    places = sorted(
-        {round(k * (count - 1) / max(1, ROWS_SHOWN - 1)) for k in range(min(count, ROWS_SHOWN))}
-    )
+    shown = min(count, ROWS_SHOWN)
+    places = sorted({round(k * (count - 1) / max(1, shown - 1)) for k in range(shown)})
     for point in (found.points[place] for place in places):
         cells = [f"{float(point.setting[name]):.6g}" for name in found.parameters]
         cells.append("not admissible" if point.refused else f"{point.value:.6f}")
