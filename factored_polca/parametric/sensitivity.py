@@ -128,6 +128,8 @@ def sensitivity(
     listed = [dict(setting) for setting in settings]
     names = tuple(dict.fromkeys(name for setting in listed for name in setting))
     run = _Run(quotient, gap, method, deadline, seed)
+    if listed:
+        quotient.run_if_clear({**quotient.process.nominal, **listed[0]})  # loads the kernels
     points: list[Point] = []
     stopped: Literal["", "time limit", "interrupted"] = ""
     try:
