@@ -331,6 +331,23 @@ def test_observations_are_merged_where_their_columns_are_proportional() -> None:
     assert quotient.observations == (("word=a / b", "word=c"),)
 
 
+def test_joint_observations_are_merged_where_their_columns_are_proportional() -> None:
+    x = boolean("x")
+    ears = [Observation(name, ["yes", "no"]) for name in ("left", "right")]
+    heard = conditional(x.next, lottery({"yes": P, "no": 1 - P}), lottery({"yes": 1 - P, "no": P}))
+    model = Model("m", [x], [Action("listen", senses=dict.fromkeys(ears, heard))],
+                  rewards=[conditional(x, 1, 0)], observability="partial", observations=ears,
+                  parameters={"p": "1/3"})  # fmt: skip
+    quotient = reduce_parametric(parametric_flat_process(model))
+    # where the ears differ the chance is p (1 - p) in either state and for either ear
+    assert sorted(quotient.observations[0]) == [
+        "left=no, right=no", "left=yes, right=no / left=no, right=yes", "left=yes, right=yes",
+    ]  # fmt: skip
+    p = sympy.Symbol("p")
+    both = quotient.observations[0].index("left=yes, right=no / left=no, right=yes")
+    assert sympy.simplify(quotient.expression(0, "listen", 0, both) - 2 * p * (1 - p)) == 0
+
+
 # -- programs ----------------------------------------------------------------------------------
 
 

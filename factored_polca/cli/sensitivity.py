@@ -45,7 +45,7 @@ def sensitivity(arguments: argparse.Namespace, output: Output) -> int:
     partial = source.model.observability == "partial"
     compile_seconds = compile_kernels(output, arguments.solver if partial else None)
     memory, deadline = limits(arguments)
-    began = time.process_time()
+    began = time.perf_counter()
     with source.located(), output.progress(f"minimising {source.name} with {', '.join(ranges)} as symbols"):
         process = opened(source, tuple(ranges), arguments, memory, deadline)
         quotient = reduce_parametric(
@@ -55,7 +55,7 @@ def sensitivity(arguments: argparse.Namespace, output: Output) -> int:
                 f"minimising {source.name}: round {number}, {blocks:,} blocks"
             ),
         )
-    minimise_seconds = time.process_time() - began
+    minimise_seconds = time.perf_counter() - began
     settings = grid({name: spaced(*row) for name, row in ranges.items()})
     with output.progress(f"solving {source.name} at {len(settings):,} settings"):
         found = study(
@@ -180,7 +180,7 @@ def parameter_data(process: ParametricProcess) -> dict[str, Any]:
 def figures(source: Source, found: Sensitivity, settings: int) -> dict[str, Any]:
     """What was done, in numbers."""
     quotient: ParametricQuotient = found.quotient
-    instantiate, solve = found.mean_microseconds()
+    instantiate, solve = found.median_microseconds()
     good = found.admissible
     return {
         "model": source.model.name,
