@@ -168,6 +168,12 @@ def test_intervals_of_one_parameter_are_joined() -> None:
     assert region_text(parametric_flat_process(model).conditions) == ["0 <= p <= 1/3"]
 
 
+def test_a_long_condition_is_only_named_for_people() -> None:
+    process = parametric_flat_process(coin(chance((1 - P * Q) ** 12 * (P + Q) ** 6 / 64)))
+    assert region_text(process.conditions) == ["0 <= a function of p, q <= 1"]
+    assert len(str(process.conditions[0])) > 200
+
+
 # -- partitions --------------------------------------------------------------------------------
 
 

@@ -229,7 +229,7 @@ def write(found: Sensitivity, path: str, name: str) -> None:
         writer.writerow([*found.parameters, "value", "lower", "upper", "policy", "refused"])
         for row in rows(found):
             keys = (*found.parameters, "value", "lower", "upper", "policy", "refused")
-            writer.writerow(["" if row[key] is None else row[key] for key in keys])
+            writer.writerow(["" if row[key] is None or row[key] != row[key] else row[key] for key in keys])
         write_text(path, text.getvalue)
         return
     from factored_polca.display.sensitivity_plot import picture

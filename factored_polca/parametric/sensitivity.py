@@ -32,6 +32,9 @@ from factored_polca.solvers.value_iteration import Iterate, value_iteration
 DENSE: Final = 100
 """Blocks up to which a policy is evaluated by a dense system."""
 
+TIE: Final = 1e-9
+"""Part of the largest value within which two actions are equally good, and the last policy is kept."""
+
 Progress = Callable[[int, int], None]
 """Called after each setting with how many are done, and of how many."""
 
@@ -249,7 +252,9 @@ class _Warm:
         self.entries: IntArray = np.concatenate(entries) if entries else np.empty(0, dtype=np.int64)
         self.rewards: IntArray = quotient.rewards[self.pairs.action, self.pairs.state]
         self.all = _all_registers(quotient)
-        self.choice: IntArray | None = None
+        taken = np.flatnonzero(policy[self.pairs.state] == self.pairs.action)
+        self.choice: IntArray = np.full(self.pairs.nodes, -1, dtype=np.int64)
+        self.choice[self.pairs.owner[taken]] = taken
 
     @staticmethod
     def fits(quotient: ParametricQuotient, registers: FloatArray) -> bool:
@@ -269,14 +274,15 @@ class _Warm:
     def solve(
         self, pairs: Pairs, gap: float, deadline: float | None
     ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Bounds on the values [block], and a policy [block] -> choice."""
+        """Bounds on the values [block], and a policy [block] -> choice: the last one where it ties."""
         found = self.unchanged(pairs, gap, deadline)
         if found is None:
             found = policy_iteration(pairs, StopRule(gap, deadline), self.choice)
-        stop_unless_solved(found.status)
-        self.choice = found.choice
+            stop_unless_solved(found.status)
+            margin = TIE * max(1.0, float(np.abs(found.values).max(initial=0.0)))
+            self.choice = greedy_choice(pairs, pairs.q_values(found.middle), self.choice, margin)
         policy = np.full(pairs.nodes, -1, dtype=np.int64)
-        policy[pairs.free] = pairs.action[found.choice[pairs.free]]
+        policy[pairs.free] = pairs.action[self.choice[pairs.free]]
         lower, upper = (
             np.where(self.dead, -np.inf, side) for side in (found.interval.lower, found.interval.upper)
         )
@@ -284,7 +290,7 @@ class _Warm:
 
     def unchanged(self, pairs: Pairs, gap: float, deadline: float | None) -> Iterate | None:
         """The solution where the last policy is optimal still, of few blocks: one dense system."""
-        if self.choice is None or pairs.nodes > DENSE:
+        if pairs.nodes > DENSE:
             return None
         values = self.evaluate(pairs, self.choice)
         margin = SWITCH_MARGIN * max(1.0, float(np.abs(values).max(initial=0.0)))
