@@ -67,7 +67,8 @@ class Sensitivity:
     """The points of a study in the order of the settings.
 
     `policies` are the different optimal policies [block] -> choice that were met, of fully observed
-    processes.  `stopped` tells why settings are missing at the end.
+    processes; one counts as optimal still while no other action is better by `TIE` of the largest value.
+    `stopped` tells why settings are missing at the end.
     """
 
     quotient: ParametricQuotient
