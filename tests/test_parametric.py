@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from parametric_models import generic, parametric_mdp, parametric_pomdp, settings
 
+from factored_polca.diagrams import evaluate_states
 from factored_polca.explicit import minimiser
 from factored_polca.explicit.alpha_expansion import forward_values
-from factored_polca.explicit.dynamic_programming import action_values, lost_states
+from factored_polca.explicit.dynamic_programming import action_values, evaluate_policy, lost_states
 from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.exact_pomdp import ExactPOMDP, enumerate_pomdp
+from factored_polca.minimisation import Reduction
 from factored_polca.models import Model
 from factored_polca.parametric import (
     ParametricQuotient,
@@ -52,7 +54,6 @@ def brute_force(exact: ExactMDP | ExactPOMDP) -> tuple[int, ...]:
 def blocks_of(quotient: ParametricQuotient, exact: ExactMDP | ExactPOMDP) -> np.ndarray:
     """The quotient's block of each enumerated state."""
     symbolic = quotient.process.process.symbolic
-    from factored_polca.diagrams import evaluate_states
 
     digits = [[f.index(v) for f, v in zip(exact.features, s, strict=True)] for s in exact.state_values]
     states = np.array(digits, dtype=np.int32)
@@ -89,6 +90,41 @@ def test_the_instance_is_the_quotient_of_the_instantiated_model_or_finer(kind: s
             check_values(quotient, exact, block, values)
         else:
             check_forward(quotient, exact, block, values, seed)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), [(kind, seed) for kind in ("mdp", "pomdp") for seed in range(12)]
+)
+def test_the_reduction_at_a_setting_is_the_same_process_and_lifts_policies(kind: str, seed: int) -> None:
+    model, quotient = reduced(kind, seed)
+    for values in settings(seed, 3):
+        reduction = quotient.reduction(values)
+        one, other = (
+            (reduction.mdp, quotient.mdp(values)) if kind == "mdp"
+            else (reduction.pomdp_quotient.pomdp.to_mdp(), quotient.pomdp(values).to_mdp())
+        )  # fmt: skip
+        for a in range(len(one.actions)):
+            difference = one.transitions[a].toarray() - other.transitions[a].toarray()
+            assert np.abs(difference).max() < 1e-12
+        np.testing.assert_allclose(one.rewards, other.rewards, rtol=1e-12, atol=1e-12)
+        if kind == "mdp":
+            check_lifted(reduction, enumerated(model, values), quotient)
+
+
+def check_lifted(reduction: Reduction, exact: ExactMDP, quotient: ParametricQuotient) -> None:
+    """The optimal policy of the instance, at every state, earns its value there."""
+    solution = solve_mdp(reduction.mdp, epsilon=1e-12)
+    block = blocks_of(quotient, exact).tolist()
+    flat = exact.to_arrays()
+    policy = [int(solution.policy[b]) for b in block]
+    live = ~np.isneginf(solution.values[block])
+    earned = evaluate_policy(flat, policy)
+    np.testing.assert_allclose(earned[live], solution.values[block][live], rtol=1e-9, atol=1e-9)
+    lifted = reduction.lift_policy(solution.policy)
+    symbolic = reduction.process.symbolic
+    digits = [[f.index(v) for f, v in zip(exact.features, s, strict=True)] for s in exact.state_values]
+    taken = evaluate_states(lifted, np.array(digits, dtype=np.int32), symbolic.columns())
+    assert [int(a) for a in taken] == [len(flat.actions) if a < 0 else a for a in policy]
 
 
 def check_rows(

@@ -168,6 +168,12 @@ def test_intervals_of_one_parameter_are_joined() -> None:
     assert region_text(parametric_flat_process(model).conditions) == ["0 <= p <= 1/3"]
 
 
+def test_a_long_condition_is_only_named_for_people() -> None:
+    process = parametric_flat_process(coin(chance((1 - P * Q) ** 12 * (P + Q) ** 6 / 64)))
+    assert region_text(process.conditions) == ["0 <= a function of p, q <= 1"]
+    assert len(str(process.conditions[0])) > 200
+
+
 # -- partitions --------------------------------------------------------------------------------
 
 
@@ -329,6 +335,23 @@ def test_observations_are_merged_where_their_columns_are_proportional() -> None:
     quotient = reduce_parametric(parametric_flat_process(model))
     # b is to a as 1 - p to p wherever x is: one observation; the tone tells nothing
     assert quotient.observations == (("word=a / b", "word=c"),)
+
+
+def test_joint_observations_are_merged_where_their_columns_are_proportional() -> None:
+    x = boolean("x")
+    ears = [Observation(name, ["yes", "no"]) for name in ("left", "right")]
+    heard = conditional(x.next, lottery({"yes": P, "no": 1 - P}), lottery({"yes": 1 - P, "no": P}))
+    model = Model("m", [x], [Action("listen", senses=dict.fromkeys(ears, heard))],
+                  rewards=[conditional(x, 1, 0)], observability="partial", observations=ears,
+                  parameters={"p": "1/3"})  # fmt: skip
+    quotient = reduce_parametric(parametric_flat_process(model))
+    # where the ears differ the chance is p (1 - p) in either state and for either ear
+    assert sorted(quotient.observations[0]) == [
+        "left=no, right=no", "left=yes, right=no / left=no, right=yes", "left=yes, right=yes",
+    ]  # fmt: skip
+    p = sympy.Symbol("p")
+    both = quotient.observations[0].index("left=yes, right=no / left=no, right=yes")
+    assert sympy.simplify(quotient.expression(0, "listen", 0, both) - 2 * p * (1 - p)) == 0
 
 
 # -- programs ----------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def sensitivity(arguments: argparse.Namespace, output: Output) -> int:
     partial = source.model.observability == "partial"
     compile_seconds = compile_kernels(output, arguments.solver if partial else None)
     memory, deadline = limits(arguments)
-    began = time.process_time()
+    began = time.perf_counter()
     with source.located(), output.progress(f"minimising {source.name} with {', '.join(ranges)} as symbols"):
         process = opened(source, tuple(ranges), arguments, memory, deadline)
         quotient = reduce_parametric(
@@ -55,7 +55,7 @@ def sensitivity(arguments: argparse.Namespace, output: Output) -> int:
                 f"minimising {source.name}: round {number}, {blocks:,} blocks"
             ),
         )
-    minimise_seconds = time.process_time() - began
+    minimise_seconds = time.perf_counter() - began
     settings = grid({name: spaced(*row) for name, row in ranges.items()})
     with output.progress(f"solving {source.name} at {len(settings):,} settings"):
         found = study(
@@ -180,7 +180,7 @@ def parameter_data(process: ParametricProcess) -> dict[str, Any]:
 def figures(source: Source, found: Sensitivity, settings: int) -> dict[str, Any]:
     """What was done, in numbers."""
     quotient: ParametricQuotient = found.quotient
-    instantiate, solve = found.mean_microseconds()
+    instantiate, solve = found.median_microseconds()
     good = found.admissible
     return {
         "model": source.model.name,
@@ -229,7 +229,7 @@ def write(found: Sensitivity, path: str, name: str) -> None:
         writer.writerow([*found.parameters, "value", "lower", "upper", "policy", "refused"])
         for row in rows(found):
             keys = (*found.parameters, "value", "lower", "upper", "policy", "refused")
-            writer.writerow(["" if row[key] is None else row[key] for key in keys])
+            writer.writerow(["" if row[key] is None or row[key] != row[key] else row[key] for key in keys])
         write_text(path, text.getvalue)
         return
     from factored_polca.display.sensitivity_plot import picture
@@ -255,8 +255,8 @@ def show(data: dict[str, Any], found: Sensitivity, output: Output) -> None:
         table.add_row("minimised once in", seconds(data["minimise_seconds"]))
         table.add_row(
             "for each setting",
-            f"{data['instantiate_microseconds']:,.0f} us to set, "
-            f"{data['solve_microseconds']:,.0f} us to solve",
+            f"{data['instantiate_microseconds'] / 1000:.3f} ms to set, "
+            f"{data['solve_microseconds'] / 1000:.3f} ms to solve",
         )
     output.table(table)
     columns = dict.fromkeys(found.parameters, "right") | {"value": "right"}
@@ -264,9 +264,8 @@ def show(data: dict[str, Any], found: Sensitivity, output: Output) -> None:
         columns["policy"] = "right"
     points = make_table("some of the settings", columns)
     count = len(found.points)
-    places = sorted(
-        {round(k * (count - 1) / max(1, ROWS_SHOWN - 1)) for k in range(min(count, ROWS_SHOWN))}
-    )
+    shown = min(count, ROWS_SHOWN)
+    places = sorted({round(k * (count - 1) / max(1, shown - 1)) for k in range(shown)})
     for point in (found.points[place] for place in places):
         cells = [f"{float(point.setting[name]):.6g}" for name in found.parameters]
         cells.append("not admissible" if point.refused else f"{point.value:.6f}")

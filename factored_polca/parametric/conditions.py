@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal
+from typing import Final, Literal
 
 from factored_polca.diagrams import Diagram, choose, leaves
 from factored_polca.minimisation import DecisionProcess
@@ -26,6 +26,9 @@ from factored_polca.models.rational_functions import (
 from factored_polca.parametric.substitution import rows_of
 from factored_polca.symbolic import RowDiagram
 from factored_polca.symbolic.rows import Row
+
+LONGEST_TEXT: Final = 120
+"""Characters of a condition up to which it is written out for people."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,14 @@ class Condition:
             return f"0 <= {self.function} <= 1"
         positive = self.function.over[0][1] > 0
         return f"{self.function if positive else -self.function} != 0"
+
+    def short_text(self) -> str:
+        """The condition, a long function in it only named."""
+        text = str(self)
+        if len(text) <= LONGEST_TEXT:
+            return text
+        named = f"a function of {', '.join(self.function.parameters)}"
+        return f"0 <= {named} <= 1" if self.kind == "probability" else f"{named} != 0"
 
     def interval(self) -> tuple[str, Fraction, Fraction] | None:
         """The parameter and its bounds, where that is all there is to it: of a linear function of one."""
@@ -79,7 +90,7 @@ def region_text(conditions: Sequence[Condition]) -> list[str]:
     for condition in conditions:
         found = condition.interval()
         if found is None:
-            rest.append(str(condition))
+            rest.append(condition.short_text())
             continue
         name, low, high = found
         known = intervals.get(name, (low, high))

@@ -15,7 +15,7 @@ Joint observations are merged where their columns are proportional as functions,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Final
 
@@ -25,7 +25,13 @@ from scipy.sparse import csr_array
 
 from factored_polca.explicit.arrays import ArrayMDP, BoolArray, FloatArray, IntArray, SparseMatrix
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
-from factored_polca.minimisation import Minimisation, Partition
+from factored_polca.minimisation import (
+    Minimisation,
+    Partition,
+    Reduction,
+    make_pomdp_quotient,
+    make_quotient,
+)
 from factored_polca.minimisation.push import Int32Array
 from factored_polca.models.model import rational
 from factored_polca.parametric.process import ParametricProcess, checked_setting
@@ -192,6 +198,21 @@ class ParametricQuotient:
         """The exact reward at a setting; 0 where the choice is not applicable."""
         register = self.rewards[choice, block]
         return self.program.run_exactly(self.setting(values), np.array([register]))[int(register)]
+
+    def reduction(self, values: Setting) -> Reduction:
+        """The reduction at a setting by the same partition: it projects beliefs and lifts policies.
+
+        It is made anew from the model's numbers at the setting, without the program: slower, and a check.
+
+        Raises:
+            ModelError: see `setting`.
+        """
+        process = self.process.at(self.setting(values))
+        partition = replace(self.partition, symbolic=process.symbolic)
+        found = replace(self.minimisation, process=process, partition=partition)
+        if process.partial:
+            return Reduction(found, make_pomdp_quotient(process, partition))
+        return Reduction(found, make_quotient(process, partition))
 
     # -- functions ---------------------------------------------------------------------------
 

@@ -14,19 +14,26 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.parametric.quotient import ParametricQuotient
 from factored_polca.solvers.choose import solve_mdp
-from factored_polca.solvers.evaluation import FACTORISATION_LIMIT, StopRule, TimeIsUp
-from factored_polca.solvers.pairs import Pairs
-from factored_polca.solvers.policy_iteration import policy_iteration
+from factored_polca.solvers.evaluation import FACTORISATION_LIMIT, StopRule, TimeIsUp, greedy_choice
+from factored_polca.solvers.pairs import Pairs, running_total
+from factored_polca.solvers.policy_iteration import SWITCH_MARGIN, policy_iteration
 from factored_polca.solvers.pomdp_choose import solve_pomdp
 from factored_polca.solvers.pomdp_result import Demand
 from factored_polca.solvers.preparation import prepare
+from factored_polca.solvers.value_iteration import Iterate, value_iteration
+
+DENSE: Final = 100
+"""Blocks up to which a policy is evaluated by a dense system."""
+
+TIE: Final = 1e-9
+"""Part of the largest value within which two actions are equally good, and the last policy is kept."""
 
 Progress = Callable[[int, int], None]
 """Called after each setting with how many are done, and of how many."""
@@ -37,7 +44,7 @@ class Point:
     """One setting: bounds on the optimal value at b0, and which of the study's policies is optimal.
 
     `refused` tells why there is no value; `policy` is -1 then, and where policies are not compared.
-    Seconds are of the process' clock.
+    `warm` tells that the policy of the setting before was the start.
     """
 
     setting: Mapping[str, Fraction]
@@ -60,7 +67,8 @@ class Sensitivity:
     """The points of a study in the order of the settings.
 
     `policies` are the different optimal policies [block] -> choice that were met, of fully observed
-    processes.  `stopped` tells why settings are missing at the end.
+    processes; one counts as optimal still while no other action is better by `TIE` of the largest value.
+    `stopped` tells why settings are missing at the end.
     """
 
     quotient: ParametricQuotient
@@ -79,15 +87,14 @@ class Sensitivity:
         """The points that have a value."""
         return tuple(point for point in self.points if not point.refused)
 
-    def mean_microseconds(self) -> tuple[float, float]:
-        """The mean time of an instantiation and of a solution."""
+    def median_microseconds(self) -> tuple[float, float]:
+        """The median time of an instantiation and of a solution; NaN without any."""
         good = self.admissible
         if not good:
             return float("nan"), float("nan")
-        return (
-            1e6 * sum(point.instantiate_seconds for point in good) / len(good),
-            1e6 * sum(point.solve_seconds for point in good) / len(good),
-        )
+        times = np.array([(point.instantiate_seconds, point.solve_seconds) for point in good])
+        instantiate, solve = (1e6 * np.median(times, axis=0)).tolist()
+        return instantiate, solve
 
 
 def grid(ranges: Mapping[str, Sequence[Fraction]]) -> list[dict[str, Fraction]]:
@@ -128,6 +135,8 @@ def sensitivity(
     listed = [dict(setting) for setting in settings]
     names = tuple(dict.fromkeys(name for setting in listed for name in setting))
     run = _Run(quotient, gap, method, deadline, seed)
+    if listed:
+        quotient.run_if_clear({**quotient.process.nominal, **listed[0]})  # loads the kernels
     points: list[Point] = []
     stopped: Literal["", "time limit", "interrupted"] = ""
     try:
@@ -168,7 +177,7 @@ class _Run:
         """
         StopRule(deadline=self.deadline).poll()
         quotient = self.quotient
-        began = time.process_time()
+        began = time.perf_counter()
         values = {**quotient.process.nominal, **setting}
         clear = quotient.run_if_clear(values)
         if clear is None:
@@ -179,20 +188,20 @@ class _Run:
         registers = quotient.program.run(values) if clear is None else clear
         if quotient.partial:
             pomdp = quotient.pomdp_of(registers)
-            middle = time.process_time()
+            middle = time.perf_counter()
             demand = Demand(self.gap, self.deadline, None, self.seed)
             found = solve_pomdp(pomdp, self.method, demand=demand)
             stop_unless_solved(found.status)
-            spent = time.process_time() - middle
+            spent = time.perf_counter() - middle
             return Point(values, found.lower, found.upper, -1, "", middle - began, spent, False)
         if self.warm is not None and self.warm.same_structure(registers):
             pairs = self.warm.pairs_of(registers)
-            middle = time.process_time()
+            middle = time.perf_counter()
             lower, upper, policy = self.warm.solve(pairs, self.gap, self.deadline)
             warm = True
         else:
             mdp = quotient.mdp_of(registers)
-            middle = time.process_time()
+            middle = time.perf_counter()
             solution = solve_mdp(mdp, epsilon=self.gap, deadline=self.deadline)
             stop_unless_solved(solution.status)
             lower, upper, policy = solution.lower, solution.upper, solution.policy
@@ -202,7 +211,7 @@ class _Run:
         initial = registers[quotient.initial]
         bounds = [_expected(initial, side) for side in (lower, upper)]
         number = self.number(policy)
-        spent = time.process_time() - middle
+        spent = time.perf_counter() - middle
         return Point(values, bounds[0], bounds[1], number, "", middle - began, spent, warm)
 
     def number(self, policy: IntArray) -> int:
@@ -244,7 +253,9 @@ class _Warm:
         self.entries: IntArray = np.concatenate(entries) if entries else np.empty(0, dtype=np.int64)
         self.rewards: IntArray = quotient.rewards[self.pairs.action, self.pairs.state]
         self.all = _all_registers(quotient)
-        self.choice: IntArray | None = None
+        taken = np.flatnonzero(policy[self.pairs.state] == self.pairs.action)
+        self.choice: IntArray = np.full(self.pairs.nodes, -1, dtype=np.int64)
+        self.choice[self.pairs.owner[taken]] = taken
 
     @staticmethod
     def fits(quotient: ParametricQuotient, registers: FloatArray) -> bool:
@@ -264,16 +275,47 @@ class _Warm:
     def solve(
         self, pairs: Pairs, gap: float, deadline: float | None
     ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Bounds on the values [block], and a policy [block] -> choice."""
-        found = policy_iteration(pairs, StopRule(gap, deadline), self.choice)
-        stop_unless_solved(found.status)
-        self.choice = found.choice
+        """Bounds on the values [block], and a policy [block] -> choice: the last one where it ties."""
+        found = self.unchanged(pairs, gap, deadline)
+        if found is None:
+            found = policy_iteration(pairs, StopRule(gap, deadline), self.choice)
+            stop_unless_solved(found.status)
+            margin = TIE * max(1.0, float(np.abs(found.values).max(initial=0.0)))
+            self.choice = greedy_choice(pairs, pairs.q_values(found.middle), self.choice, margin)
         policy = np.full(pairs.nodes, -1, dtype=np.int64)
-        policy[pairs.free] = pairs.action[found.choice[pairs.free]]
+        policy[pairs.free] = pairs.action[self.choice[pairs.free]]
         lower, upper = (
             np.where(self.dead, -np.inf, side) for side in (found.interval.lower, found.interval.upper)
         )
         return lower, upper, policy
+
+    def unchanged(self, pairs: Pairs, gap: float, deadline: float | None) -> Iterate | None:
+        """The solution where the last policy is optimal still, of few blocks: one dense system."""
+        if pairs.nodes > DENSE:
+            return None
+        values = self.evaluate(pairs, self.choice)
+        margin = SWITCH_MARGIN * max(1.0, float(np.abs(values).max(initial=0.0)))
+        q = pairs.q_values(values)
+        if not np.array_equal(greedy_choice(pairs, q, self.choice, margin), self.choice):
+            return None
+        found = value_iteration(pairs, StopRule(gap, deadline), values)
+        return replace(found, choice=self.choice) if found.status == "converged" else None
+
+    def evaluate(self, pairs: Pairs, choice: IntArray) -> FloatArray:
+        """The value of a policy [node]: (I - discount P) v = R."""
+        free = pairs.free
+        taken = choice[free]
+        lengths = pairs.row[taken + 1] - pairs.row[taken]
+        entries = np.repeat(pairs.row[taken] - running_total(lengths)[:-1], lengths) + np.arange(
+            lengths.sum()
+        )
+        matrix = np.eye(pairs.nodes)
+        place = np.repeat(free, lengths) * pairs.nodes + pairs.successor[entries]
+        weights = pairs.probability[entries]
+        matrix -= pairs.discount * np.bincount(place, weights, pairs.nodes**2).reshape(matrix.shape)
+        right = np.zeros(pairs.nodes)
+        right[free] = pairs.reward[taken]
+        return np.asarray(np.linalg.solve(matrix, right))
 
 
 def _all_registers(quotient: ParametricQuotient) -> IntArray:
