@@ -1,4 +1,5 @@
-"""The indicators of blocks of a partition, or weighted sums of some, and their regressions, with shared nodes done once.
+"""The indicators of blocks of a partition, or weighted sums of some, and their regressions; shared nodes
+are done once.
 
 The indicators of different blocks share most of their lower nodes.  Without synchronic arcs
 
@@ -20,8 +21,8 @@ from factored_polca.symbolic import NumericView
 
 
 class Indicators:
-    """For each pack of blocks b_0, b_1, .. the diagram in `field` that is base^j where `labels` has the leaf
-    b_j, else 0.
+    """For each pack of blocks b_0, b_1, .. the diagram in `field` that is base^j where `labels` has the
+    leaf b_j, else 0.
 
     `nodes` are handles on their distinct nodes, children first; `children[i]` and `roots[pack]` number
     nodes; `levels[i]` is a node's level.

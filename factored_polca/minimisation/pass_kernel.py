@@ -81,7 +81,8 @@ def run_passes(
     row_roots: npt.NDArray[np.int32], row_identity: npt.NDArray[np.int32],
     row_fixed: npt.NDArray[np.int32], row_base: npt.NDArray[np.int64], row_last: Int64Array,
     entry_first: Int64Array, entry_value: Int32Array, entry_weight: Int32Array, entry_weights: Int32Array,
-    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
+    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array,
+    collect_at: int, passes: int,
 ) -> int:  # fmt: skip
     """Passes over all choices until D is 0, or `passes` are done (counted in `numbers`).
 

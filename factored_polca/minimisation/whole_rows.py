@@ -8,6 +8,8 @@ is given to the blocks, so nothing is random.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, MemoryLimit, choose, node_count, relabel
@@ -29,7 +31,7 @@ class WholeRows:
         self.labels = relabel(labels, shifted, INDEX)
         self.outside = None if outside is None else outside + 1
         self.budget = max(STEPS, leaves * node_count(labels))
-        self.known: dict[bytes, int] = {}
+        self.known: dict[Hashable, int] = {}
         self.leaving: set[int] = set()
         self.found: dict[int, Diagram | None] = {}
 
@@ -57,7 +59,7 @@ class WholeRows:
                     return None
         except MemoryLimit:
             return None
-        rows = forward.row_bytes()
+        rows = forward.whole_rows()
         numbers = [self.known.setdefault(row, len(self.known) + 1) for row in rows]
         if self.outside is not None:
             reached = forward.reached(self.outside)

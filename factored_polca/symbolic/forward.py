@@ -7,6 +7,7 @@ beforehand which of the two is quicker.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -150,10 +151,10 @@ class ForwardRegression:
         )  # fmt: skip
         return self.join(totals, self.field)
 
-    def row_bytes(self) -> list[bytes]:
+    def whole_rows(self) -> list[Hashable]:
         """The rows of the last level's items, when all are there: what arrives at each of V's leaves.
 
-        Equal rows, of whatever action and with the same V and field, have equal bytes.
+        Equal rows, of whatever action and with the same V and field, are equal objects.
         """
         lengths = np.diff(self.first)
         order = np.lexsort((self.entry_numbers, np.repeat(np.arange(self.items), lengths)))
