@@ -20,9 +20,9 @@ The sum is one random linear form of all rows of a state: where some f_c differ 
 Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them, or,
 where `width[p]` is not 0, the row p of those that `run_descent` takes.
 
-    progress    [choice, stage, place in the choice's list of primitives; in stage 4 what to split by]
+    progress    [choice, stage, place in the choice's list of primitives]
     counts      [nodes of D]
-    signatures  f_c [choice], of the choices done in this pass
+    signatures  f_c [choice], of the choices done in this pass; one more, the sum of all
     factors     the leaf s_c [choice]
 """
 
@@ -93,9 +93,10 @@ def run_passes(
     choices = len(choice_first) - 1
     zero = sums[ZERO]
     while live[DIFFERENCE] != zero and passes > numbers[PASSES]:
-        while progress[CHOICE] < choices:
+        while progress[CHOICE] <= choices:  # the last is the form of all
             c = progress[CHOICE]
-            first = choice_first[c]
+            first = choice_first[min(c, choices)]
+            last = choice_first[min(c + 1, choices)]
             if progress[STEP] == 0:
                 if head[0] > collect_at:
                     return PAUSE
@@ -104,7 +105,7 @@ def run_passes(
                 walked[1] = 0
                 progress[STEP] = 1
             if progress[STEP] == 1:
-                while progress[PLACE] < choice_first[c + 1]:
+                while progress[PLACE] < last:
                     p = choice_primitive[progress[PLACE]]
                     if regressed[p] == 0:
                         value = int64(live[DIFFERENCE])
@@ -155,20 +156,26 @@ def run_passes(
                             walked[1] = 0
                     progress[PLACE] += 1
                 count = int64(0)
-                for j in range(first, choice_first[c + 1]):
+                for j in range(first, last):
                     part = regressed[choice_primitive[j]]
                     if part != zero:
                         terms[2 * count] = choice_mask[j]
                         terms[2 * count + 1] = part
                         count += 1
+                if c == choices:
+                    for j in range(choices):
+                        if signatures[j] != zero:
+                            terms[2 * count] = factors[j]
+                            terms[2 * count + 1] = signatures[j]
+                            count += 1
                 begin_sum(stack, sum_state, count, plain[NORMALISED])
                 progress[STEP] = 2
                 if count == 0:
                     signatures[c] = zero
-                    progress[STEP] = 3
-                elif count == 1 and terms[0] == plain[ONE]:
+                    progress[STEP] = 0
+                elif count == 1 and (c == choices or terms[0] == plain[ONE]):
                     signatures[c] = terms[1]
-                    progress[STEP] = 3
+                    progress[STEP] = 0
             if progress[STEP] == 2:
                 code = run_weighted_sum(
                     pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
@@ -179,33 +186,10 @@ def run_passes(
                 head[2] += STEPS - sum_state[2]
                 sum_state[2] = STEPS
                 signatures[c] = results[0]
+                progress[STEP] = 0
             progress[CHOICE] += 1
-            progress[STEP] = 0
-            if progress[CHOICE] == choices:
-                count = int64(0)
-                for j in range(choices):
-                    if signatures[j] != zero:
-                        terms[2 * count] = factors[j]
-                        terms[2 * count + 1] = signatures[j]
-                        count += 1
-                begin_sum(stack, sum_state, count, plain[NORMALISED])
-                progress[STEP] = 3
-                if count < 2:
-                    progress[PLACE] = terms[1] if count == 1 else zero
-                    progress[STEP] = 4
-        if progress[STEP] == 3:
-            code = run_weighted_sum(
-                pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
-                results, sum_state,
-            )  # fmt: skip
-            if code != DONE:
-                return code
-            head[2] += STEPS - sum_state[2]
-            sum_state[2] = STEPS
-            progress[PLACE] = results[0]
-            progress[STEP] = 4
         code = run_split(
-            pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
+            pool, head, unique, arity, cache, stack, results, words, signatures[choices], operators,
             field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
             nodes, images, new_blocks, exact, changes, rough, state, work,
         )  # fmt: skip
@@ -216,7 +200,6 @@ def run_passes(
         for p in range(len(regressed)):
             regressed[p] = 0
         progress[CHOICE] = 0
-        progress[STEP] = 0
         numbers[PASSES] += 1
         if numbers[BLOCKS] > numbers[ALLOWED]:
             return BEYOND

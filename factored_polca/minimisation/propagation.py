@@ -101,7 +101,7 @@ class Propagation:
         self.factors = [
             self.manager.stored_constant(f, self.field) for f in draw(len(self.choices)).tolist()
         ]
-        self.signatures = np.zeros(len(self.choices), dtype=np.int32)
+        self.signatures = np.zeros(len(self.choices) + 1, dtype=np.int32)
         self.signature_handles: list[Diagram] = []
         self._list_choices()
         self._prepare_primitives()

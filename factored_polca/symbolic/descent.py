@@ -4,8 +4,8 @@ A row that looks at levels below its own is cut there: each of its nodes that st
 above, is a row of its own, whose weights are diagrams over what is below.
 
 Only *suited* actions go this way: those with few carried features, as the context is compared at every
-step, in models in which some variable has many values.  With two or three values each the way from the bottom up
-takes as many steps, and shorter ones.
+step, in models in which some variable has many values.  With two or three values each the way from the
+bottom up takes as many steps, and shorter ones.
 """
 
 from __future__ import annotations
