@@ -55,6 +55,9 @@ from factored_polca.minimisation.split_kernel import (
 )
 
 UInt64Array = npt.NDArray[np.uint64]
+FloatArray = npt.NDArray[np.float64]
+Int32Table = npt.NDArray[np.int32]
+Int64Table = npt.NDArray[np.int64]
 
 PAUSE, BEYOND = 17, 18
 """Other answers: the caller may look around, between two passes or where it is time to collect garbage; the
@@ -69,17 +72,17 @@ def run_passes(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array, stack: Int32Array, terms: Int32Array,
     results: Int32Array, words: Int32Array, sums: Int64Array, plain: Int64Array,
-    operators: npt.NDArray[np.int64], field: UInt64Array, one: np.uint64, inverses: UInt64Array,
-    weights: Int32Array, first_weights: npt.NDArray[np.int64], last_changed: Int64Array,
+    operators: Int64Table, field: UInt64Array, one: np.uint64, inverses: UInt64Array,
+    weights: Int32Array, first_weights: Int64Table, last_changed: Int64Array,
     keys: Int64Array, choice_first: Int64Array, choice_primitive: Int64Array, choice_mask: Int32Array,
     regressed: Int32Array, live: Int32Array, numbers: Int64Array, elements: UInt64Array,
     block_shares: UInt64Array, touched: UInt64Array, largest: Int32Array, fresh: UInt64Array,
     nodes: Int32Array, images: Int32Array, new_blocks: Int32Array, exact: UInt64Array,
-    changes: UInt64Array, rough: npt.NDArray[np.float64], changed: Int32Array, counts: Int64Array,
+    changes: UInt64Array, rough: FloatArray, changed: Int32Array, counts: Int64Array,
     sum_state: Int64Array, walked: Int64Array, state: Int64Array, work: Int64Array,
-    progress: Int64Array, width: Int64Array, carried: npt.NDArray[np.int64],
-    row_roots: npt.NDArray[np.int32], row_identity: npt.NDArray[np.int32],
-    row_fixed: npt.NDArray[np.int32], row_base: npt.NDArray[np.int64], row_last: Int64Array,
+    progress: Int64Array, width: Int64Array, carried: Int64Table,
+    row_roots: Int32Table, row_identity: Int32Table,
+    row_fixed: Int32Table, row_base: Int64Table, row_last: Int64Array,
     entry_first: Int64Array, entry_value: Int32Array, entry_weight: Int32Array, entry_weights: Int32Array,
     frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array,
     collect_at: int, passes: int,

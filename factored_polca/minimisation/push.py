@@ -315,7 +315,7 @@ def push_floats(
             for j in range(1, ends):
                 _heap_push(leaves, j, leaves[j])
             size = ends
-            for _ in range(ends):
+            for j in range(ends):
                 k = leaves[0]
                 size = _heap_pop(leaves, size)
                 blocks[state[1] + j] = k
