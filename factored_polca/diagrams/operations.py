@@ -369,15 +369,13 @@ def choose(condition: Diagram, then: Diagram, otherwise: Diagram) -> Diagram:
 def sum_options(manager: Manager, leaf_type: LeafType, normalised: bool) -> npt.NDArray[np.int64]:
     """The options that weighted sums over `leaf_type` pass to their kernels, until the next collection."""
     key = ("normalised sum" if normalised else "sum", leaf_type)
-    known = manager.operator_rows.get(key)
-    if known is not None:
-        return known
+    if key in manager.operator_rows:
+        return manager.operator_rows[key]
     is_field = isinstance(leaf_type, Field)
     number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else 0
     zero, one = manager.constant(0, leaf_type), manager.constant(1, leaf_type)
     values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field]
-    options = manager.operator_rows[key] = np.array(values, dtype=np.int64)
-    return options
+    return manager.operator_rows.setdefault(key, np.array(values, dtype=np.int64))
 
 
 def weighted_sum(
