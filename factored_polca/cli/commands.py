@@ -32,7 +32,7 @@ def compile_kernels(output: Output, pomdp_method: str | None = None) -> float:
     from factored_polca.hierarchy.warm import is_compiled, warm_up
 
     def work(elsewhere: subprocess.Popen[bytes] | None) -> None:
-        warm_up()
+        warm_up(None if elsewhere is None or pomdp_method is not None else elsewhere.wait)
         if pomdp_method is not None:
             from factored_polca.solvers import warm_pomdp
 
@@ -61,15 +61,18 @@ def announced_compiling(output: Output) -> Iterator[None]:
 
 @contextmanager
 def compiling_elsewhere(pomdp_method: str | None) -> Iterator[subprocess.Popen[bytes] | None]:
-    """A second process that compiles the kernels of a POMDP solver, where there is a core for it.
+    """A second process that compiles the kernels of a POMDP solver, or the minimiser's largest one, where
+    there is a core for it.
 
     It leaves them on disk, from where this process loads them.  Should it fail, this process compiles
     them itself.
     """
-    if pomdp_method is None or (os.cpu_count() or 1) < 2:
+    if (os.cpu_count() or 1) < 2:
         yield None
         return
-    program = f"from factored_polca.solvers.warm_pomdp import warm_up; warm_up({pomdp_method!r})"
+    program = "from factored_polca.hierarchy.warm import compile_passes; compile_passes()"
+    if pomdp_method is not None:
+        program = f"from factored_polca.solvers.warm_pomdp import warm_up; warm_up({pomdp_method!r})"
     process = subprocess.Popen(
         [sys.executable, "-P", "-c", program],
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,

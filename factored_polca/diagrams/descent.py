@@ -2,10 +2,10 @@
 
     R_a[V](x) = sum over x' of prod_i P(x_i' | x) V(x')
 
-Each changed feature's row is a diagram over its own level and those above, which selects entries (v, weight);
-a weight is a diagram over the levels below, in most models a number.  A *context* holds for each changed
-feature whose row looks above its own level, the *carried* ones, the node of that diagram, cofactored by the
-values of the levels above:
+Each changed feature's row is a diagram over its own level and those above, which selects entries
+(v, weight); a weight is a diagram over the levels below, in most models a number.  A *context* holds for
+each changed feature whose row looks above its own level, the *carried* ones, the node of that diagram,
+cofactored by the values of the levels above:
 
     T(n, context)   what becomes of V's node n where the features above it have the values that led there.
 

@@ -60,3 +60,26 @@ def compiled_before() -> bool:
         if not os.path.exists(path):
             return False
     return True
+
+
+_TYPES: dict[str, Any] = {
+    "Int32Array": numba.int32[::1],
+    "Int64Array": numba.int64[::1],
+    "UInt64Array": numba.uint64[::1],
+    "FloatArray": numba.float64[::1],
+    "Int32Table": numba.int32[:, ::1],
+    "Int64Table": numba.int64[:, ::1],
+    "int": numba.int64,
+    "np.uint64": numba.uint64,
+}
+
+
+def compile_ahead(compiled: Any) -> None:
+    """Compile a kernel for the arguments that its annotations name, without calling it.
+
+    Raises:
+        KeyError: an annotation that names no type known here.
+    """
+    annotations = dict(compiled.py_func.__annotations__)
+    annotations.pop("return")
+    compiled.compile(tuple(_TYPES[name] for name in annotations.values()))

@@ -22,6 +22,7 @@ from factored_polca.diagrams.leaves import FLOAT, INDEX, FloatLeaves, LeafType, 
 from factored_polca.diagrams.manager import Manager, require
 from factored_polca.diagrams.nodes import STEPS, Int32Array, add_node
 from factored_polca.diagrams.operators import OPERATORS, Kind, OperatorRow
+from factored_polca.diagrams.sums import sum_options
 from factored_polca.diagrams.walk import collect, rebuild
 from factored_polca.diagrams.weighted import run_weighted_sum
 
@@ -364,23 +365,6 @@ def choose(condition: Diagram, then: Diagram, otherwise: Diagram) -> Diagram:
 
     manager.run(step)
     return manager.handle(int(manager.results[0]), then.leaf_type)
-
-
-def sum_options(
-    manager: Manager, leaf_type: LeafType, normalised: bool, step: float = 0.0
-) -> npt.NDArray[np.int64]:
-    """The options that weighted sums over `leaf_type` pass to their kernels.
-
-    Sums of floats are rounded to multiples of `step`, a power of 2, where it is not 0.
-    """
-    is_field = isinstance(leaf_type, Field)
-    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else 0
-    if step:
-        number = manager.step_number(step)
-    zero, one = manager.constant(0, leaf_type), manager.constant(1, leaf_type)
-    bits = int(np.float64(step).view(np.int64))
-    values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field, bits]
-    return np.array(values, dtype=np.int64)
 
 
 def weighted_sum(

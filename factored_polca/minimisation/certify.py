@@ -8,7 +8,9 @@ terminal flag and applicable choices, and for each applicable choice c
 (a stochastic bisimulation: Dean & Givan 1997; Givan, Dean & Greig 2003).  That makes its quotient
 exact.  That it is the *coarsest* such partition is another question, which is not asked here.
 
-Each block's indicator is regressed through each choice, modulo several fixed primes.  A function is
+Where rows look up only, all rows T_c(x, .) modulo a fixed prime are made at once, as wholes
+(`factored_polca.minimisation.whole_rows`), and what is checked is that the number of the row is constant on
+every block.  Elsewhere each block's indicator is regressed through each choice.  A function is
 constant on every block exactly where it equals the partition relabelled by the function's values at
 the representatives, and equality of two diagrams is equality of two nodes.
 
@@ -61,6 +63,7 @@ from factored_polca.minimisation.indicators import Indicators
 from factored_polca.minimisation.partition import Partition
 from factored_polca.minimisation.push import make_plan, push_exact, row_table, rows_at
 from factored_polca.minimisation.quotient import exact_rewards, primitives_at
+from factored_polca.minimisation.whole_rows import WholeRows
 from factored_polca.models import LimitReached, ModelError
 from factored_polca.symbolic import NumericView
 
@@ -103,8 +106,8 @@ def certify(
 ) -> Certificate:
     """Check that `partition` is stable under `process` and separates different rewards.
 
-    States outside a restriction of the process are ignored.  The number of regressions is blocks
-    times primitives times primes.
+    States outside a restriction of the process are ignored.  Where rows look down the number of
+    regressions is blocks times primitives times primes, divided by the blocks of a pack.
 
     Args:
         failure_limit: stop after so many failures.
@@ -142,6 +145,30 @@ def certify(
     return check.certificate(complete=True)
 
 
+class _Regressed:
+    """Indicators of packs of blocks, regressed through one primitive after the other when asked for."""
+
+    def __init__(
+        self, numbers: NumericView, labels: Diagram, packs: list[list[int]], base: int, field: Field
+    ) -> None:
+        self.numbers, self.labels, self.packs, self.base, self.field = numbers, labels, packs, base, field
+        self.indicators: Indicators | None = None
+        self.parts: dict[int, list[Diagram]] = {}
+
+    def of_choice(self, view: ProcessView, choice: Choice, k: int) -> Diagram:
+        """The probability, as a function of the state, that the choice enters the blocks of pack k."""
+        if self.indicators is None:
+            self.indicators = Indicators(self.labels, self.packs, self.base, self.field)
+        for primitive in choice.primitives:
+            if primitive not in self.parts:
+                self.parts[primitive] = self.indicators.regress(self.numbers, primitive)
+        return view.select(choice, {p: self.parts[p][k] for p in choice.primitives})
+
+    def keep(self, primitives: set[int]) -> None:
+        """Forget all others."""
+        self.parts = {p: parts for p, parts in self.parts.items() if p in primitives}
+
+
 class _Check:
     """The working state of one certification."""
 
@@ -162,6 +189,7 @@ class _Check:
         if process.reachable is not None:
             self.labels = choose(self.inside, self.labels, self.manager.constant(self.outside))
         self.leaves = [int(leaf) for leaf in leaves(self.labels)]
+        self.largest, self.leaf_array = max(self.leaves), np.array(self.leaves)
         self.states = states_for_leaves(self.labels)  # [leaf, level]
         self.row_bits = [_row_bound(process, c).bit_length() + 1 for c in process.choices]  # [choice]
         self.reward_bits = [_reward_bound(process, c).bit_length() + 1 for c in process.choices]
@@ -236,24 +264,47 @@ class _Check:
         assert isinstance(field, Field)
         if not wanted:
             return
-        indicators = Indicators(self.labels, self.leaves, field)
-        regressed: dict[int, list[Diagram]] = {}
+        inside = self.outside if self.outside in self.leaves else None
+        whole = WholeRows(view.numbers, self.labels, self.largest + 1, inside)
+        packs = _Regressed(view.numbers, self.labels, *self.packs(wanted), field)
+        single = _Regressed(view.numbers, self.labels, [[leaf] for leaf in self.leaves], 1, field)
         for place, c in enumerate(wanted):
-            choice = self.process.choices[c]
-            for primitive in choice.primitives:
-                if primitive not in regressed:
-                    regressed[primitive] = indicators.regress(view.numbers, primitive)
-            for k, block in enumerate(self.leaves):
-                self.manager.pause()
-                entered = view.select(choice, {p: regressed[p][k] for p in choice.primitives})
-                found = self.differing(entered, zero=block == self.outside)
-                if found is not None and (c, block) not in self.known:
-                    self.known.add((c, block))
-                    yield self.describe_row(choice, block, found)
+            choice, before = self.process.choices[c], self.checks
+            if not self.rows_agree(view, whole, choice) and not self.packs_agree(view, packs, choice):
+                self.checks = before
+                for k, block in enumerate(self.leaves):
+                    self.manager.pause()
+                    found = self.differing(single.of_choice(view, choice, k), zero=block == self.outside)
+                    if found is not None and (c, block) not in self.known:
+                        self.known.add((c, block))
+                        yield self.describe_row(choice, block, found)
+            self.checks = before + len(self.leaves)
             if self.progress is not None:
                 self.progress(self.checks, self.planned)
             later = {p for d in wanted[place + 1 :] for p in self.process.choices[d].primitives}
-            regressed = {p: parts for p, parts in regressed.items() if p in later}
+            packs.keep(later)
+            single.keep(later)
+
+    def rows_agree(self, view: ProcessView, whole: WholeRows, choice: Choice) -> bool:
+        """Whether the rows of all states of a block are seen to be equal as wholes."""
+        rows = whole.of_choice(choice, view.app(choice))
+        return rows is not None and not whole.leaves_restriction(rows) and self.differing(rows) is None
+
+    def packs(self, wanted: list[int]) -> tuple[list[list[int]], int]:
+        """Blocks that are checked together, and B: as many as go into 60 bits for every choice wanted."""
+        bits = max(self.row_bits[c] for c in wanted)
+        size = max(1, 60 // bits)
+        blocks = [leaf for leaf in self.leaves if leaf != self.outside]
+        packs = [blocks[i : i + size] for i in range(0, len(blocks), size)]
+        return packs + [[leaf] for leaf in self.leaves if leaf == self.outside], 1 << bits
+
+    def packs_agree(self, view: ProcessView, packs: _Regressed, choice: Choice) -> bool:
+        """Whether all packs of blocks are entered alike from all states of a block."""
+        for k, pack in enumerate(packs.packs):
+            self.manager.pause()
+            if self.differing(packs.of_choice(view, choice, k), zero=pack == [self.outside]) is not None:
+                return False
+        return True
 
     def differing(self, function: Diagram, zero: bool = False) -> Int32Array | None:
         """Two states [2, level] of one block where `function` differs, or None.
@@ -261,12 +312,14 @@ class _Check:
         With `zero` it must be 0 everywhere.  The function is masked: 0 outside the restriction.
         """
         self.checks += 1
+        if function.is_constant and not zero:
+            return None
         if zero:
             same = function.equals(self.manager.constant(0, function.leaf_type))
         else:
             values = evaluate_states(function, self.states, range(self.manager.leaf_level))
-            images = np.zeros(max(self.leaves) + 1, dtype=np.uint64)
-            images[self.leaves] = values
+            images = np.zeros(self.largest + 1, dtype=np.uint64)
+            images[self.leaf_array] = values
             expected = relabel(self.labels, images, function.leaf_type)
             if expected == function:
                 return None

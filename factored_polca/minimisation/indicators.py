@@ -1,4 +1,5 @@
-"""The indicators of all blocks of a partition, and their regressions, with shared nodes done once.
+"""The indicators of blocks of a partition, or weighted sums of some, and their regressions; shared nodes
+are done once.
 
 The indicators of different blocks share most of their lower nodes.  Without synchronic arcs
 
@@ -20,18 +21,20 @@ from factored_polca.symbolic import NumericView
 
 
 class Indicators:
-    """For each of `blocks` the diagram in `field` that is 1 where `labels` has that leaf, else 0.
+    """For each pack of blocks b_0, b_1, .. the diagram in `field` that is base^j where `labels` has the
+    leaf b_j, else 0.
 
-    `nodes` are handles on their distinct nodes, children first; `children[i]` and `roots[b]` number
+    `nodes` are handles on their distinct nodes, children first; `children[i]` and `roots[pack]` number
     nodes; `levels[i]` is a node's level.
     """
 
-    def __init__(self, labels: Diagram, blocks: Sequence[int], field: Field) -> None:
+    def __init__(self, labels: Diagram, packs: Sequence[Sequence[int]], base: int, field: Field) -> None:
         manager = self.manager = labels.manager
         diagrams = []
-        for block in blocks:
-            images = np.zeros(max(blocks) + 1, dtype=np.uint64)
-            images[block] = field.encode(1)
+        largest = max(max(pack) for pack in packs)
+        for pack in packs:
+            images = np.zeros(largest + 1, dtype=np.uint64)
+            images[list(pack)] = [field.encode(base**j) for j in range(len(pack))]
             diagrams.append(relabel(labels, images, field))
         # No operation from here to the handles: it might collect garbage and renumber the nodes.
         met = np.zeros(int(manager.head[0]), dtype=np.bool_)

@@ -25,6 +25,7 @@ from factored_polca.diagrams import (
     states_for_leaves,
     states_of_leaves,
 )
+from factored_polca.diagrams.operations import Walk
 from factored_polca.drawn import Drawn, Framed
 from factored_polca.symbolic import SymbolicModel
 
@@ -42,10 +43,10 @@ class Partition(Drawn, Framed):
     def representatives(self) -> npt.NDArray[np.int32]:
         """The first state of each block, as value numbers int32 [block, level]."""
         states = states_for_leaves(self.diagram)
+        numbers = Walk(self.diagram).leaf_payloads().astype(np.int64)
         result = np.zeros((self.blocks, self.symbolic.manager.leaf_level), dtype=np.int32)
-        for state, leaf in zip(states, leaves(self.diagram), strict=True):
-            if int(leaf) < self.blocks:
-                result[int(leaf)] = state
+        inside = numbers < self.blocks
+        result[numbers[inside]] = states[inside]
         return result
 
     @cached_property

@@ -20,9 +20,9 @@ The sum is one random linear form of all rows of a state: where some f_c differ 
 Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them, or,
 where `width[p]` is not 0, the row p of those that `run_descent` takes.
 
-    progress    [choice, stage, place in the choice's list of primitives; in stage 4 what to split by]
+    progress    [choice, stage, place in the choice's list of primitives]
     counts      [nodes of D]
-    signatures  f_c [choice], of the choices done in this pass
+    signatures  f_c [choice], of the choices done in this pass; one more, the sum of all
     factors     the leaf s_c [choice]
 """
 
@@ -55,6 +55,9 @@ from factored_polca.minimisation.split_kernel import (
 )
 
 UInt64Array = npt.NDArray[np.uint64]
+FloatArray = npt.NDArray[np.float64]
+Int32Table = npt.NDArray[np.int32]
+Int64Table = npt.NDArray[np.int64]
 
 PAUSE, BEYOND = 17, 18
 """Other answers: the caller may look around, between two passes or where it is time to collect garbage; the
@@ -69,19 +72,20 @@ def run_passes(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     slots: Int64Array, ring: Int32Array, ring_state: Int64Array, stack: Int32Array, terms: Int32Array,
     results: Int32Array, words: Int32Array, sums: Int64Array, plain: Int64Array,
-    operators: npt.NDArray[np.int64], field: UInt64Array, one: np.uint64, inverses: UInt64Array,
-    weights: Int32Array, first_weights: npt.NDArray[np.int64], last_changed: Int64Array,
+    operators: Int64Table, field: UInt64Array, one: np.uint64, inverses: UInt64Array,
+    weights: Int32Array, first_weights: Int64Table, last_changed: Int64Array,
     keys: Int64Array, choice_first: Int64Array, choice_primitive: Int64Array, choice_mask: Int32Array,
     regressed: Int32Array, live: Int32Array, numbers: Int64Array, elements: UInt64Array,
     block_shares: UInt64Array, touched: UInt64Array, largest: Int32Array, fresh: UInt64Array,
     nodes: Int32Array, images: Int32Array, new_blocks: Int32Array, exact: UInt64Array,
-    changes: UInt64Array, rough: npt.NDArray[np.float64], changed: Int32Array, counts: Int64Array,
+    changes: UInt64Array, rough: FloatArray, changed: Int32Array, counts: Int64Array,
     sum_state: Int64Array, walked: Int64Array, state: Int64Array, work: Int64Array,
-    progress: Int64Array, width: Int64Array, carried: npt.NDArray[np.int64],
-    row_roots: npt.NDArray[np.int32], row_identity: npt.NDArray[np.int32],
-    row_fixed: npt.NDArray[np.int32], row_base: npt.NDArray[np.int64], row_last: Int64Array,
+    progress: Int64Array, width: Int64Array, carried: Int64Table,
+    row_roots: Int32Table, row_identity: Int32Table,
+    row_fixed: Int32Table, row_base: Int64Table, row_last: Int64Array,
     entry_first: Int64Array, entry_value: Int32Array, entry_weight: Int32Array, entry_weights: Int32Array,
-    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
+    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array,
+    collect_at: int, passes: int,
 ) -> int:  # fmt: skip
     """Passes over all choices until D is 0, or `passes` are done (counted in `numbers`).
 
@@ -92,9 +96,10 @@ def run_passes(
     choices = len(choice_first) - 1
     zero = sums[ZERO]
     while live[DIFFERENCE] != zero and passes > numbers[PASSES]:
-        while progress[CHOICE] < choices:
+        while progress[CHOICE] <= choices:  # the last is the form of all
             c = progress[CHOICE]
-            first = choice_first[c]
+            first = choice_first[min(c, choices)]
+            last = choice_first[min(c + 1, choices)]
             if progress[STEP] == 0:
                 if head[0] > collect_at:
                     return PAUSE
@@ -103,7 +108,7 @@ def run_passes(
                 walked[1] = 0
                 progress[STEP] = 1
             if progress[STEP] == 1:
-                while progress[PLACE] < choice_first[c + 1]:
+                while progress[PLACE] < last:
                     p = choice_primitive[progress[PLACE]]
                     if regressed[p] == 0:
                         value = int64(live[DIFFERENCE])
@@ -154,20 +159,26 @@ def run_passes(
                             walked[1] = 0
                     progress[PLACE] += 1
                 count = int64(0)
-                for j in range(first, choice_first[c + 1]):
+                for j in range(first, last):
                     part = regressed[choice_primitive[j]]
                     if part != zero:
                         terms[2 * count] = choice_mask[j]
                         terms[2 * count + 1] = part
                         count += 1
+                if c == choices:
+                    for j in range(choices):
+                        if signatures[j] != zero:
+                            terms[2 * count] = factors[j]
+                            terms[2 * count + 1] = signatures[j]
+                            count += 1
                 begin_sum(stack, sum_state, count, plain[NORMALISED])
                 progress[STEP] = 2
                 if count == 0:
                     signatures[c] = zero
-                    progress[STEP] = 3
-                elif count == 1 and terms[0] == plain[ONE]:
+                    progress[STEP] = 0
+                elif count == 1 and (c == choices or terms[0] == plain[ONE]):
                     signatures[c] = terms[1]
-                    progress[STEP] = 3
+                    progress[STEP] = 0
             if progress[STEP] == 2:
                 code = run_weighted_sum(
                     pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
@@ -178,33 +189,10 @@ def run_passes(
                 head[2] += STEPS - sum_state[2]
                 sum_state[2] = STEPS
                 signatures[c] = results[0]
+                progress[STEP] = 0
             progress[CHOICE] += 1
-            progress[STEP] = 0
-            if progress[CHOICE] == choices:
-                count = int64(0)
-                for j in range(choices):
-                    if signatures[j] != zero:
-                        terms[2 * count] = factors[j]
-                        terms[2 * count + 1] = signatures[j]
-                        count += 1
-                begin_sum(stack, sum_state, count, plain[NORMALISED])
-                progress[STEP] = 3
-                if count < 2:
-                    progress[PLACE] = terms[1] if count == 1 else zero
-                    progress[STEP] = 4
-        if progress[STEP] == 3:
-            code = run_weighted_sum(
-                pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
-                results, sum_state,
-            )  # fmt: skip
-            if code != DONE:
-                return code
-            head[2] += STEPS - sum_state[2]
-            sum_state[2] = STEPS
-            progress[PLACE] = results[0]
-            progress[STEP] = 4
         code = run_split(
-            pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
+            pool, head, unique, arity, cache, stack, results, words, signatures[choices], operators,
             field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
             nodes, images, new_blocks, exact, changes, rough, state, work,
         )  # fmt: skip
@@ -215,7 +203,6 @@ def run_passes(
         for p in range(len(regressed)):
             regressed[p] = 0
         progress[CHOICE] = 0
-        progress[STEP] = 0
         numbers[PASSES] += 1
         if numbers[BLOCKS] > numbers[ALLOWED]:
             return BEYOND

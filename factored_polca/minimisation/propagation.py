@@ -22,8 +22,9 @@ from factored_polca.diagrams.apply import (
     RIGHT_ABSORBING,
 )
 from factored_polca.diagrams.nodes import DONE, FULL, STEPS, YIELDED
-from factored_polca.diagrams.operations import Walk, operator_row, sum_options
+from factored_polca.diagrams.operations import Walk, operator_row
 from factored_polca.diagrams.operators import OPERATORS
+from factored_polca.diagrams.sums import sum_options
 from factored_polca.minimisation.criterion import Choice, ProcessView
 from factored_polca.minimisation.pass_kernel import BEYOND, PAUSE, run_passes
 from factored_polca.minimisation.race import Race
@@ -101,7 +102,7 @@ class Propagation:
         self.factors = [
             self.manager.stored_constant(f, self.field) for f in draw(len(self.choices)).tolist()
         ]
-        self.signatures = np.zeros(len(self.choices), dtype=np.int32)
+        self.signatures = np.zeros(len(self.choices) + 1, dtype=np.int32)
         self.signature_handles: list[Diagram] = []
         self._list_choices()
         self._prepare_primitives()

@@ -56,6 +56,7 @@ class PushPlan:
     slots: tuple[Slot, ...]
     roots: Int32Array  # [root]
     slot: Int32Array  # [place], -1 at the ends
+    level: Int32Array  # [place], 0 for the first that there is, 1 for the next, ..
     first_child: Int64Array  # [place]
     children: Int32Array  # flat
     leaf: Int64Array  # [place]
@@ -133,8 +134,14 @@ def make_plan(symbolic: SymbolicModel, diagram: Diagram, rows: Mapping[int, RowD
     ends[at_end] = leaf_payloads(manager, ends[at_end].astype(np.int32)).astype(np.int64)
     return PushPlan(
         tuple(slots), np.array([numbers[start] for start in starts], dtype=np.int32),
-        np.array(slot_of, dtype=np.int32), first, np.array(children, dtype=np.int32), ends,
+        np.array(slot_of, dtype=np.int32), _ranks([key[2] for key in order]), first,
+        np.array(children, dtype=np.int32), ends,
     )  # fmt: skip
+
+
+def _ranks(levels: npt.ArrayLike) -> Int32Array:
+    """Levels, in ascending order, counted without gaps."""
+    return np.cumsum(np.diff(levels, prepend=np.asarray(levels)[:1]) > 0).astype(np.int32)
 
 
 def _needed_parents(symbolic: SymbolicModel, diagram: Diagram, rows: Mapping[int, RowDiagram]) -> set[int]:
@@ -174,7 +181,8 @@ def _plain_plan(symbolic: SymbolicModel, diagram: Diagram) -> PushPlan:
     return PushPlan(
         tuple(Slot(i) for i in range(len(symbolic.order))),
         number[-1:].copy(),
-        feature_at[levels].astype(np.int32), first.astype(np.int64), children.astype(np.int32), leaf,
+        feature_at[levels].astype(np.int32), _ranks(levels), first.astype(np.int64),
+        children.astype(np.int32), leaf,
     )  # fmt: skip
 
 
@@ -251,72 +259,94 @@ PAIRS = 1 << 19
 
 @kernel
 def push_floats(
-    roots: Int32Array, slot: Int32Array, first_child: Int64Array, children: Int32Array,
+    roots: Int32Array, slot: Int32Array, level: Int32Array, first_child: Int64Array, children: Int32Array,
     leaf: Int64Array, start: Int64Array, value: Int32Array, probability: FloatArray,
     chosen: Int32Array, row_ends: Int64Array, blocks: Int64Array, masses: FloatArray, state: Int64Array,
 ) -> int:  # fmt: skip
     """Write the rows of states state[0].. as (block, mass) pairs.
 
     Answers 0 when done, 1 if the room ran out, 2 after `PAIRS` pairs, so that Ctrl-C is seen.
-    `state` is [next row, pairs written].  Places are numbered level by level; a binary heap yields the
-    touched ones in that order, so a place has all its mass when it is taken.
+    `state` is [next row, pairs written].  Each level has a list of its places that mass has come to, so
+    that a place has all its mass when it is taken; a level's list begins where its places do.
     """
     places = len(slot)
+    levels = level[places - 1] + 1
+    begins = np.zeros(levels, np.int64)
+    for j in range(places - 1):
+        if level[j + 1] != level[j]:
+            begins[level[j + 1]] = j + 1
+    count = np.zeros(levels, np.int64)
+    waiting = np.empty(places, np.int32)
     mass = np.zeros(places, np.float64)
-    heap = np.empty(places + 1, np.int32)
     largest = 0
     for q in range(places):
         if leaf[q] > largest:
             largest = leaf[q]
     total = np.zeros(largest + 1, np.float64)
-    touched = np.empty(largest + 1, np.int32)
     leaves = np.empty(largest + 2, np.int32)
     pause_at = state[1] + PAIRS
     while state[0] < len(chosen):
         if state[1] >= pause_at:
             return 2
         row = state[0]
-        size = 0
         ends = 0
+        smallest = largest
         for j in range(len(roots)):
-            if mass[roots[j]] == 0.0:
-                size = _heap_push(heap, size, roots[j])
-            mass[roots[j]] += 1.0
-        while size > 0:
-            q = heap[0]
-            size = _heap_pop(heap, size)
-            m = mass[q]
-            mass[q] = 0.0
-            if m == 0.0:
-                continue
-            if slot[q] < 0:
-                k = leaf[q]
-                if total[k] == 0.0:
-                    touched[ends] = k
-                    ends += 1
-                total[k] += m
-                continue
-            r = chosen[row, slot[q]]
-            for e in range(start[r], start[r + 1]):
-                child = children[first_child[q] + value[e]]
-                if child < 0:
+            q = roots[j]
+            if mass[q] == 0.0:
+                waiting[begins[level[q]] + count[level[q]]] = q
+                count[level[q]] += 1
+            mass[q] += 1.0
+        for at in range(levels):
+            for i in range(begins[at], begins[at] + count[at]):
+                q = waiting[i]
+                m = mass[q]
+                mass[q] = 0.0
+                if m == 0.0:
                     continue
-                if mass[child] == 0.0:
-                    size = _heap_push(heap, size, child)
-                mass[child] += m * probability[e]
+                if slot[q] < 0:
+                    k = leaf[q]
+                    if total[k] == 0.0:
+                        leaves[ends] = k
+                        ends += 1
+                        smallest = min(smallest, k)
+                    total[k] += m
+                    continue
+                r = chosen[row, slot[q]]
+                for e in range(start[r], start[r + 1]):
+                    child = children[first_child[q] + value[e]]
+                    part = m * probability[e]
+                    if child < 0 or part == 0.0:  # 0 where it is too small for a float
+                        continue
+                    if mass[child] == 0.0:
+                        waiting[begins[level[child]] + count[level[child]]] = child
+                        count[level[child]] += 1
+                    mass[child] += part
+            count[at] = 0
         if state[1] + ends > len(blocks):
             for j in range(ends):
-                total[touched[j]] = 0.0
+                total[leaves[j]] = 0.0
             return 1
-        for j in range(ends):
-            size = _heap_push(leaves, size, touched[j])
-        for j in range(ends):
-            k = leaves[0]
-            size = _heap_pop(leaves, size)
-            blocks[state[1] + j] = k
-            masses[state[1] + j] = total[k]
-            total[k] = 0.0
-        state[1] += ends
+        if 8 * ends < largest - smallest:
+            for j in range(1, ends):
+                _heap_push(leaves, j, leaves[j])
+            size = ends
+            for j in range(ends):
+                k = leaves[0]
+                size = _heap_pop(leaves, size)
+                blocks[state[1] + j] = k
+                masses[state[1] + j] = total[k]
+                total[k] = 0.0
+            state[1] += ends
+        else:
+            k = smallest
+            for _ in range(ends):
+                while total[k] == 0.0:
+                    k += 1
+                blocks[state[1]] = k
+                masses[state[1]] = total[k]
+                total[k] = 0.0
+                state[1] += 1
         row_ends[row] = state[1]
         state[0] += 1
     return 0

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from math import lcm
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ from factored_polca.minimisation.push import (
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import RowDiagram, SymbolicModel
 from factored_polca.symbolic.floats import as_float
+
+DIRECT = 1 << 22
+"""Combinations of entries up to which they are found by indexing, beyond by sorting."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +157,30 @@ def distinct_rewards(
     terms = process.rewards[primitive]
     if not terms:
         return [Fraction(0)], np.zeros(len(states), dtype=np.int64)
-    entries = np.stack([evaluate_states(term.diagram, states, columns) for term in terms], axis=1)
-    distinct, place = np.unique(entries.astype(np.int64), axis=0, return_inverse=True)
+    entries = [evaluate_states(term.diagram, states, columns).astype(np.int64) for term in terms]
+    key, size = np.zeros(len(states), dtype=np.int64), 1
+    for term, entry in zip(terms, entries, strict=True):
+        if size * len(term.values) > DIRECT:
+            found, key = np.unique(key, return_inverse=True)
+            size = len(found)
+        key = key.reshape(-1) * len(term.values) + entry
+        size *= len(term.values)
+    if size > DIRECT:
+        found, key = np.unique(key, return_inverse=True)
+        size = len(found)
+    example = np.full(size, -1, dtype=np.int64)  # a state for each key that occurs
+    example[key] = np.arange(len(states))
+    present = np.flatnonzero(example >= 0)
+    place = np.zeros(size, dtype=np.int64)
+    place[present] = np.arange(len(present))
+    common = lcm(*(value.denominator for term in terms for value in term.values))
+    cleared = [[int(value * common) for value in term.values] for term in terms]
+    rows = np.stack([entry[example[present]] for entry in entries], axis=1)
     sums = [
-        sum((term.values[number] for term, number in zip(terms, row, strict=True)), Fraction(0))
-        for row in distinct.tolist()
+        Fraction(sum([values[number] for values, number in zip(cleared, row, strict=True)]), common)
+        for row in rows.tolist()
     ]
-    return sums, place.reshape(-1).astype(np.int64)
+    return sums, place[key]
 
 
 def exact_rewards(
@@ -181,12 +202,17 @@ def make_quotient(process: DecisionProcess, partition: Partition) -> Quotient:
         primitive[c] = primitives_at(choice, states, columns)
     terminal = evaluate_states(process.terminal, states, columns).astype(bool)
     plans: dict[int, tuple[PushPlan, RowTable]] = {}
+    plain: PushPlan | None = None
     rewards = np.zeros((len(process.choices), blocks))
     matrices: dict[int, tuple[npt.NDArray[np.int64], Any]] = {}
     for p in sorted({int(p) for p in np.unique(primitive)} - {-1}):
         chosen_blocks = np.flatnonzero((primitive == p).any(axis=0))
         rows = symbolic.actions[p].rows
-        plans[p] = (make_plan(symbolic, partition.diagram, rows), row_table(symbolic, rows))
+        if any(row.parents_next for row in rows.values()):
+            plan = make_plan(symbolic, partition.diagram, rows)
+        else:  # one for all
+            plan = plain = plain or make_plan(symbolic, partition.diagram, rows)
+        plans[p] = (plan, row_table(symbolic, rows))
         matrix = push_states(partition, rows, *plans[p], states[chosen_blocks])
         matrices[p] = (chosen_blocks, matrix)
         sums, place = distinct_rewards(process, p, states[chosen_blocks])
@@ -245,7 +271,7 @@ def push_all(
     while True:
         symbolic.manager.pause()
         code = push_floats(
-            plan.roots, plan.slot, plan.first_child, plan.children, plan.leaf,
+            plan.roots, plan.slot, plan.level, plan.first_child, plan.children, plan.leaf,
             table.start, table.value, table.probability, chosen, row_ends, found, masses, state,
         )  # fmt: skip
         if most is not None and state[1] > most:

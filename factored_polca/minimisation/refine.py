@@ -6,8 +6,8 @@ regression through choice c, masked.
     0. P_0 separates states by terminal flag, applicable choices and a random linear form of the rewards.
     1. one pass: for each choice c, V = r o P, f_c = R_c[V]; P becomes the distinct pairs (P, f_c).
     2. a pass without a split ends the refinement;
-    3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a split there
-       sends the refinement on with that prime.
+    3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a
+       split there sends the refinement on with that prime.
 
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
 the first `EARLY` passes after the first one are confirming passes: one without a split is the last.

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, Diagram
-from factored_polca.diagrams.operations import sum_options
+from factored_polca.diagrams.sums import sum_options
 from factored_polca.symbolic import NumericView, SymbolicModel
 from factored_polca.symbolic.regression import Prepared
 

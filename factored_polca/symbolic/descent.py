@@ -1,11 +1,11 @@
 """What the regression from the top down, `factored_polca.diagrams.descent`, needs of several actions.
 
-A row that looks at levels below its own is cut there: each of its nodes that stands below, reached from above,
-is a row of its own, whose weights are diagrams over what is below.
+A row that looks at levels below its own is cut there: each of its nodes that stands below, reached from
+above, is a row of its own, whose weights are diagrams over what is below.
 
-Only *suited* actions go this way: those with few carried features, as the context is compared at every step,
-in models in which some variable has many values.  With two or three values each the way from the bottom up
-takes as many steps, and shorter ones.
+Only *suited* actions go this way: those with few carried features, as the context is compared at every
+step, in models in which some variable has many values.  With two or three values each the way from the
+bottom up takes as many steps, and shorter ones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy.typing as npt
 from factored_polca.diagrams import Diagram, Field
 from factored_polca.diagrams.descent import HEADER, run_descent, stride
 from factored_polca.diagrams.nodes import STEPS
-from factored_polca.diagrams.operations import Walk, node, sum_options
+from factored_polca.diagrams.operations import Walk, node
+from factored_polca.diagrams.sums import sum_options
 from factored_polca.symbolic.regression import NumericView
 from factored_polca.symbolic.rows import RowDiagram
 
@@ -87,11 +88,12 @@ Cuts = dict[tuple[int, int, int], Cut]
 
 
 class Descents:
-    """Arrays over the primitive actions `actions`, in their order (-1: none); nodes are of the last `refresh`.
+    """Arrays over the primitive actions `actions`, in their order (-1: none); nodes are of the last
+    `refresh`.
 
     `known` keeps the cuts from one field to the next.  `width[p]` is the number of carried features, -1
-    where an action is not suited, `few[p]` whether it is and changes few features; `carried`, `roots` and `identity` are [p, carried feature],
-    `fixed` and `base` [p, level].
+    where an action is not suited, `few[p]` whether it is and changes few features; `carried`, `roots` and
+    `identity` are [p, carried feature], `fixed` and `base` [p, level].
     """
 
     def __init__(self, numbers: NumericView, actions: Sequence[int], known: Cuts) -> None:
@@ -144,9 +146,10 @@ class Descents:
                     self.fixed[p, c.level] = c.diagram.node
 
     def regress(self, place: int, value: Diagram) -> Diagram:
-        """The regression of a function of the features through the suited action at a place of `actions`."""
+        """The regression of a function of the features through one of `actions`, given its place."""
         manager, numbers = self.manager, self.numbers
-        assert isinstance(numbers.leaf_type, Field) and self.width[place] >= 0
+        assert isinstance(numbers.leaf_type, Field)
+        assert self.width[place] >= 0
         manager.safe_point()
         self.refresh()
         self.begin(place, value.node)

@@ -6,12 +6,14 @@ beforehand which of the two is quicker.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import Diagram, Field, MemoryLimit, support
+from factored_polca.diagrams import Diagram, Field, LeafType, MemoryLimit, support
 from factored_polca.diagrams.forward import (
     BUDGET,
     ENTRIES,
@@ -140,6 +142,38 @@ class ForwardRegression:
 
     def run(self, budget: int) -> Diagram | None:
         """Go on for some `budget` entries; the regression if that was enough."""
+        if not self.advance(budget):
+            return None
+        totals = np.zeros(self.items, dtype=np.uint64)
+        leaf_sums(
+            self.first, self.entry_numbers, self.weights, self.items, self.values,
+            self.field.parameters, totals,
+        )  # fmt: skip
+        return self.join(totals, self.field)
+
+    def whole_rows(self) -> list[Hashable]:
+        """The rows of the last level's items, when all are there: what arrives at each of V's leaves.
+
+        Equal rows, of whatever action and with the same V and field, are equal objects.
+        """
+        lengths = np.diff(self.first)
+        order = np.lexsort((self.entry_numbers, np.repeat(np.arange(self.items), lengths)))
+        pairs = np.stack([self.entry_numbers[order].astype(np.uint64), self.weights[order]], axis=1)
+        return [pairs[i:j].tobytes() for i, j in itertools.pairwise(self.first.tolist())]
+
+    def reached(self, leaf: int) -> npt.NDArray[np.bool_]:
+        """Whether anything arrives at the leaf with this payload, for each of the last level's items."""
+        there = np.isin(
+            self.entry_numbers,
+            np.flatnonzero((self.node_level == self.manager.leaf_level) & (self.values == leaf)),
+        )
+        return (
+            np.bincount(np.repeat(np.arange(self.items), np.diff(self.first))[there], minlength=self.items)
+            > 0
+        )
+
+    def advance(self, budget: int) -> bool:
+        """Go on for some `budget` entries; whether all items are there."""
         self.state[BUDGET] = budget
         while self.place < len(self.levels):
             level = self.levels[self.place]
@@ -152,7 +186,7 @@ class ForwardRegression:
                 self.hashes, self.slots, self.sums, self.stamps, self.met, self.taken, self.state,
             )  # fmt: skip
             if code == YIELDED:
-                return None
+                return False
             if code == SHORT:
                 self._lengthen()
                 continue
@@ -162,7 +196,7 @@ class ForwardRegression:
             self.rows = self.next_rows[: items * len(self.carried)]
             self.place += 1
             self._begin_level()
-        return self._join()
+        return True
 
     def _lengthen(self) -> None:
         """Double the arrays that receive items."""
@@ -179,15 +213,10 @@ class ForwardRegression:
         place_all(self.hashes, items, slots)
         return slots
 
-    def _join(self) -> Diagram:
-        """The nodes of all items, leaves first."""
+    def join(self, payloads: npt.NDArray[np.uint64], leaf_type: LeafType) -> Diagram:
+        """The diagram of all items, given what the leaf of each of the last level's is to hold."""
         manager = self.manager
-        totals = np.zeros(self.items, dtype=np.uint64)
-        leaf_sums(
-            self.first, self.entry_numbers, self.weights, self.items, self.values,
-            self.field.parameters, totals,
-        )  # fmt: skip
-        below = manager.leaf_nodes(totals)
+        below = manager.leaf_nodes(payloads)
         for level, child_items in zip(reversed(self.levels), reversed(self.child_items), strict=True):
             items = len(child_items) // manager.sizes[level]
             made = np.zeros(items, dtype=np.int32)
@@ -207,4 +236,4 @@ class ForwardRegression:
 
             manager.run(step)
             below = made
-        return manager.handle(int(below[0]), self.field)
+        return manager.handle(int(below[0]), leaf_type)

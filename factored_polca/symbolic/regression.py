@@ -31,7 +31,8 @@ from factored_polca.diagrams import (
     weighted_sum,
 )
 from factored_polca.diagrams.manager import STEPS
-from factored_polca.diagrams.operations import Walk, sum_options
+from factored_polca.diagrams.operations import Walk
+from factored_polca.diagrams.sums import sum_options
 from factored_polca.diagrams.weighted import run_regression
 from factored_polca.symbolic.model import SymbolicModel
 from factored_polca.symbolic.rows import Term
