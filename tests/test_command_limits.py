@@ -45,6 +45,7 @@ def test_the_backstop_lets_allocations_fail_and_goes_away() -> None:
 
 @linux
 def test_diagrams_keep_within_what_the_process_may_take() -> None:
+    payloads = np.arange(1 << 23, dtype=np.uint64)  # 16 bytes each as leaves
     limit = little_more()
     room = 8 * MIB + limit // 16 + SLACK_BYTES
     with memory_backstop(limit):
@@ -52,7 +53,7 @@ def test_diagrams_keep_within_what_the_process_may_take() -> None:
         manager = Manager([2] * 40)
         assert manager.memory_limit <= (room + 32 * MIB) * 3 // 4
         with pytest.raises(MemoryLimit):
-            manager.leaf_nodes(np.arange(1 << 24, dtype=np.uint64))
+            manager.leaf_nodes(payloads)
     manager.assert_consistent()
 
 
