@@ -5,7 +5,7 @@
 Each run is a process of its own, a copy of this one with the kernels loaded.  Good ends are a result
 (exit status 0) and a limit that is named (exit status 3 with `limit reached`).  Everything else is a fault
 and is shown at the end: a signal, a traceback, another status, a resident set beyond the limit by more than
-an eighth, or no end at all.  WORD picks the domains whose name holds it.  Runs of a command on a domain go
+an eighth and the backstop's slack, or no end at all.  WORD picks the domains whose name holds it.  Runs of a command on a domain go
 on until the first limit.
 """
 
@@ -25,6 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from factored_polca.cli import main as command_line
+from factored_polca.cli.memory import SLACK_BYTES
 from factored_polca.hierarchy.warm import warm_up
 
 SIZES: dict[str, tuple[str, ...]] = {
@@ -82,7 +83,7 @@ class End:
             return f"exit status {self.status}"
         if self.status == 3 and "limit reached" not in self.message:
             return "a limit without its name"
-        if self.peak_bytes > memory * 9 // 8:
+        if self.peak_bytes > memory * 9 // 8 + SLACK_BYTES:
             return f"{self.peak_bytes / 2**20:,.0f} MiB"
         return ""
 
