@@ -5,8 +5,8 @@
 Each run is a process of its own, a copy of this one with the kernels loaded.  Good ends are a result
 (exit status 0) and a limit that is named (exit status 3 with `limit reached`).  Everything else is a fault
 and is shown at the end: a signal, a traceback, another status, a resident set beyond the limit by more than
-an eighth and the backstop's slack, or no end at all.  WORD picks the domains whose name holds it.  Runs of a command on a domain go
-on until the first limit.
+an eighth and the backstop's slack, or no end at all.  WORD picks the domains whose name holds it.  Runs of
+a command on a domain go on until the first limit.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SIZES: dict[str, tuple[str, ...]] = {
     ),
     "sysadmin": ("size=4", "size=8", "size=12", "size=16", "size=24"),
     "taxi": ("size=5", "size=16", "size=48", "size=128", "size=256"),
-    "taxi anywhere=true": ("size=5", "size=8", "size=16", "size=32", "size=64"),
+    "taxi anywhere=true": ("size=5", "size=8", "size=16", "size=24", "size=30"),
     "tiger": ("",),
     "toy": ("",),
     "twenty_questions": ("",),
