@@ -289,8 +289,19 @@ class Manager:
         """Make room for more nodes.
 
         Raises:
-            MemoryLimit: `memory_limit` forbids it.
+            MemoryLimit: `memory_limit` forbids it, or the system has no more.
         """
+        try:
+            self._grow()
+        except MemoryLimit:
+            raise
+        except MemoryError:
+            self._collect_at = 0
+            raise MemoryLimit(
+                f"{int(self.head[1]):,} nodes in {self.bytes / 2**20:,.0f} MiB leave no memory for more"
+            ) from None
+
+    def _grow(self) -> None:
         self._note_peak()
         need = 2 + max((*self.sizes, 2))
         if self.head[0] + need > len(self.pool):

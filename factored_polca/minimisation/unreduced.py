@@ -310,6 +310,7 @@ def _list(listing: _Listing) -> tuple[Int64Array, FloatArray]:
     initial = listing.initial()
     done = 0
     while done < len(listing.states):
+        listing.symbolic.manager.pause()  # a deadline of the model's counts here too
         found = listing.states.tuples(done)
         listing.expand(done, found)
         done += len(found)

@@ -34,6 +34,9 @@ from factored_polca.models.expressions import Expression, references
 ORDERS: Final = ("auto", "file", "force", "spectral")
 """Names of the heuristics."""
 
+LARGEST_GRAPH: Final = 200_000
+"""Pairs of features in one group, counted in all groups, up to which `auto` tries the spectral order."""
+
 Group = frozenset[str]
 Arcs = Mapping[tuple[str, str], int]
 """How many actions have an arc from one feature (the parent, of now or next) to another, the child."""
@@ -172,9 +175,12 @@ def variable_order(model: Model, name: str = "auto", tasks: TaskHierarchy | None
     if name == "spectral":
         return tuple(spectral(given, found))
     candidates: list[list[str]] = [given, force(given, found)]
-    if len(given) <= 200:
+    if len(given) <= 200 and sum(len(group) ** 2 for group in found) <= LARGEST_GRAPH:
         candidates.append(force(spectral(given, found), found))
-    candidates += [candidate[::-1] for candidate in candidates]
     arcs = parent_arcs(model)
-    costs = [total_span(candidate, found) + pull_upwards(candidate, arcs) for candidate in candidates]
-    return tuple(candidates[costs.index(min(costs))])
+    costs: list[tuple[int, int, list[str]]] = []  # the number only decides between equal costs
+    for candidate in candidates:
+        span = total_span(candidate, found)
+        for order in (candidate, candidate[::-1]):
+            costs.append((span + pull_upwards(order, arcs), len(costs), order))
+    return tuple(min(costs)[2])

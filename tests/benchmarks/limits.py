@@ -5,8 +5,8 @@
 Each run is a process of its own, a copy of this one with the kernels loaded.  Good ends are a result
 (exit status 0) and a limit that is named (exit status 3 with `limit reached`).  Everything else is a fault
 and is shown at the end: a signal, a traceback, another status, a resident set beyond the limit by more than
-an eighth, or no end at all.  WORD picks the domains whose name holds it.  Runs of a command on a domain go
-on until the first limit.
+an eighth and the backstop's slack, or no end at all.  WORD picks the domains whose name holds it.  Runs of
+a command on a domain go on until the first limit.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from factored_polca.cli import main as command_line
+from factored_polca.cli.memory import SLACK_BYTES
 from factored_polca.hierarchy.warm import warm_up
 
 SIZES: dict[str, tuple[str, ...]] = {
@@ -33,8 +34,8 @@ SIZES: dict[str, tuple[str, ...]] = {
     "coffee": ("",),
     "components": ("size=4", "size=10", "size=40", "size=150", "size=400"),
     "expon": ("size=6", "size=10", "size=14", "size=18", "size=24"),
-    "hallway": ("size=5", "size=11", "size=30", "size=100", "size=400"),
-    "linear": ("size=4", "size=16", "size=64", "size=200", "size=500"),
+    "hallway": ("size=5", "size=11", "size=30", "size=100", "size=300"),
+    "linear": ("size=4", "size=16", "size=64", "size=128", "size=256"),
     "meds": ("",),
     "network": ("size=3", "size=5", "size=8", "size=12", "size=20"),
     "nursebot": ("", "topics=4", "rooms=4", "rooms=4 bystanders=2", "rooms=8 bystanders=4 patients=2"),
@@ -44,7 +45,7 @@ SIZES: dict[str, tuple[str, ...]] = {
     ),
     "sysadmin": ("size=4", "size=8", "size=12", "size=16", "size=24"),
     "taxi": ("size=5", "size=16", "size=48", "size=128", "size=256"),
-    "taxi anywhere=true": ("size=5", "size=8", "size=16", "size=32", "size=64"),
+    "taxi anywhere=true": ("size=5", "size=8", "size=16", "size=24", "size=30"),
     "tiger": ("",),
     "toy": ("",),
     "twenty_questions": ("",),
@@ -82,7 +83,7 @@ class End:
             return f"exit status {self.status}"
         if self.status == 3 and "limit reached" not in self.message:
             return "a limit without its name"
-        if self.peak_bytes > memory * 9 // 8:
+        if self.peak_bytes > memory * 9 // 8 + SLACK_BYTES:
             return f"{self.peak_bytes / 2**20:,.0f} MiB"
         return ""
 
