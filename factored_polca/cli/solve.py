@@ -14,14 +14,15 @@ import numpy as np
 from factored_polca.cli.commands import (
     compile_kernels,
     limits,
-    peak_memory_bytes,
     refuse_unwritable,
     report_warnings,
 )
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
+from factored_polca.cli.solve_symbolic import SYMBOLIC, solve_on_diagrams
 from factored_polca.cli.source import Source, UsageError, load
-from factored_polca.models import Model
+from factored_polca.models import LimitReached, Model
 from factored_polca.models.model import replace_fields
 
 if TYPE_CHECKING:
@@ -102,11 +103,18 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set)
     task = checked_task(source, arguments)
     report_warnings(source, output)
+    if task.solver == SYMBOLIC:
+        return solve_on_diagrams(task, source, arguments, output)
     compile_seconds = warm(task, output)
     began = time.perf_counter()
-    with source.located(), output.progress(f"listing the states of {source.name}"):
-        symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
-        flat = listed_unless_large(symbolic, task)
+    try:
+        with source.located(), output.progress(f"listing the states of {source.name}"):
+            symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
+            flat = listed_unless_large(symbolic, task)
+    except LimitReached as error:
+        if task.solver != "auto" or task.as_mdp or task.model.horizon is not None:
+            raise
+        return solve_on_diagrams(task, source, arguments, output, f"not listed: {error}")
     if isinstance(flat, str):
         return solve_large(symbolic, task, flat, source, arguments, output, compile_seconds)
     build_seconds = time.perf_counter() - began
