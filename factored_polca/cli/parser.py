@@ -238,7 +238,6 @@ def add_solving(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--gap", type=gap, metavar="G", help="stop at upper - lower <= G at the start")
     sub.add_argument("--epsilon", type=gap, metavar="E", help="the same as --gap")
     sub.add_argument("--time", type=positive, metavar="SECONDS", help="solve no longer than that")
-    sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit of diagrams, such as 2GB")
     sub.add_argument("--iterations", type=counting, metavar="N", help="no more than N of the solver's")
     sub.add_argument(
         "--horizon", type=horizon, metavar="H", help="steps, or infinite; the model's if not given"
