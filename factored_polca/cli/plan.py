@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,9 @@ from factored_polca.models.model import replace_fields
 if TYPE_CHECKING:
     from factored_polca.hierarchy import HierarchicalPlan, Options, PomdpPlan
     from factored_polca.simulation.measure import Measurement
+
+WIDE = 1e-6
+"""Bounds further apart than that, relative to a value beyond 1, are told in its place."""
 
 CHILD_EPISODES = 250
 """Episodes that measure a task other than the root, unless a number is given."""
@@ -246,18 +250,30 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     for row in data["tasks"]:
         if row["blocks"] is None:
             output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
-    output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
+    said = within(data["value"], data["value_bounds"])
+    output.line(f"value of the hierarchical policy from the start: [bold]{said}[/]")
     if data["flat_value"] is None:
         output.line(f"flat optimum: {escape(data['flat_note'])}")
     else:
         cost = data["flat_value"] - data["value"]
         said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
-        output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
+        texts = [within(data[key], data[f"{key}_bounds"]) for key in ("flat_value", "value")]
+        if any(" and " in text for text in texts):
+            said = "something within these bounds"
+        output.line(f"flat optimum: {texts[0]}; the hierarchy costs {said}")
     if "stored" in data:
         stored = data["stored"]
         classes, blocks = f"{stored['classes']:,}", f"{stored['blocks']:,}"
         output.line(f"stored by {stored['by']}: {classes} classes in place of {blocks} blocks")
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def within(value: float, bounds: Sequence[float]) -> str:
+    """A value, or its bounds where they are wide."""
+    low, high = bounds
+    if not high - low > WIDE * max(1.0, abs(value)):
+        return f"{value:.9g}"
+    return f"between {low:.6g} and {high:.6g}"
 
 
 def counted(count: int | None) -> str:

@@ -191,7 +191,9 @@ class Manager:
         return self._fields.setdefault(field.prime, len(self._fields) + 1)
 
     def step_number(self, step: float) -> int:
-        """As `field_number`, for floats that are rounded to multiples of a power of 2."""
+        """As `field_number`, for floats that are rounded to multiples of a power of 2 (0: they are not)."""
+        if not step:
+            return 0
         return self._fields.setdefault(-round(2000 + math.log2(step)), len(self._fields) + 1)
 
     def cache_key(self, *parts: Hashable) -> int:

@@ -21,9 +21,7 @@ def sum_options(
     if key in manager.operator_rows:
         return manager.operator_rows[key]
     is_field = isinstance(leaf_type, Field)
-    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else 0
-    if step:
-        number = manager.step_number(step)
+    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else manager.step_number(step)
     zero, one = manager.constant(0, leaf_type), manager.constant(1, leaf_type)
     bits = int(np.float64(step).view(np.int64))
     values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field, bits]

@@ -21,6 +21,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
         "value": plan.polled.value,
         "value_bounds": [plan.polled.lower, plan.polled.upper],
         "flat_value": None if plan.flat is None else plan.flat.value,
+        "flat_value_bounds": None if plan.flat is None else [plan.flat.lower, plan.flat.upper],
         "flat_blocks": None if plan.flat is None else plan.flat.blocks,
         "flat_note": plan.flat_note,
         "guarantee": guarantee(plan),
