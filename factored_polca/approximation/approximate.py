@@ -207,6 +207,23 @@ def certify_pomdp(
     return _approximation(reduction, errors, Certificate(lower, optimum, optimum, loss, None, 0.0, note))
 
 
+def certify_rows(reduction: ApproximateReduction) -> Approximation:
+    """What is certain of any policy planned on the quotient, the state not being seen, before it is solved.
+
+    `loss` is twice what the snapped rows may move the value of any policy by, and the quotient's own gap is
+    to be added to it; `lower` and `optimum` are not known.
+    """
+    errors, quotient = reduction.errors(), reduction.pomdp_quotient
+    low, high = value_span(quotient.mdp, len(reduction.process.symbolic.model.features))
+    moved = start_error(quotient.pomdp.initial, block_errors(errors, quotient.mdp, high - low))
+    note = (
+        f"any policy is worth the same within {moved:.3g} in the model and on its {reduction.partition.blocks:,} "
+        "blocks; to the loss the gap of the solver is to be added"
+    )
+    found = Certificate(-np.inf, np.inf, np.inf, 2 * moved, None, 0.0, note)
+    return _approximation(reduction, errors, found)
+
+
 def _approximation(reduction: ApproximateReduction, errors: Errors, found: Certificate) -> Approximation:
     discount = float(reduction.process.symbolic.model.discount)
     return Approximation(

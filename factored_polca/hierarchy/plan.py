@@ -34,6 +34,7 @@ from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
 from factored_polca.hierarchy.solved import SolvedTask
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
+from factored_polca.hierarchy.task_warnings import task_warnings
 from factored_polca.minimisation import DecisionProcess, Reduction, reduce
 from factored_polca.minimisation.polynomial import interchangeable_fault
 from factored_polca.minimisation.reduction import InterchangeableReduction
@@ -184,6 +185,16 @@ def plan_mdp(
         symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings,
         certified,
     )  # fmt: skip
+
+
+def solved_root(
+    symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
+) -> SolvedTask:
+    """The tasks of a checked hierarchy solved, and no more than that: the root."""
+    planner, tasks = _Planner(symbolic, hierarchy, options, progress), planning_order(hierarchy)
+    for task in tasks:
+        planner.solve(task)
+    return planner.solved[tasks[-1].name]
 
 
 class _Planner:
@@ -391,39 +402,6 @@ def refuse_unavoidable_dead_ends(root: SolvedTask) -> None:
                 )
             ]
         )
-
-
-def task_warnings(
-    task: Task, reduction: Reduction, solution: MDPSolution, dead: int, *, is_child: bool
-) -> tuple[str, ...]:
-    """What a person should know of a solved task."""
-    found = []
-    if dead:
-        found.append(
-            f"task {task.name!r}: {dead:,} states can't avoid a state that is not terminal and has no "
-            "applicable action; its policy is undefined there"
-        )
-    if not solution.converged:
-        found.append(
-            f"task {task.name!r}: the solver stopped early ({solution.status}), gap {solution.gap:.3g}"
-        )
-    if is_child and not task.has_pseudo_reward and equal_across_choices(reduction):
-        found.append(
-            f"task {task.name!r}: in each state its actions have equal rewards; a pseudo_reward would tell "
-            "it what to aim for"
-        )
-    return tuple(found)
-
-
-def equal_across_choices(reduction: Reduction) -> bool:
-    """Whether several choices, wherever they are applicable in one block, have one reward."""
-    mdp = reduction.mdp
-    several = mdp.applicable.sum(axis=0) > 1
-    if not several.any():
-        return False
-    high = np.where(mdp.applicable, mdp.rewards, -np.inf)[:, several].max(axis=0)
-    low = np.where(mdp.applicable, mdp.rewards, np.inf)[:, several].min(axis=0)
-    return bool((high <= low).all())
 
 
 def total_counts(solved: Mapping[str, SolvedTask] | Sequence[SolvedTask]) -> QValueCounts:

@@ -150,6 +150,16 @@ def plan_pomdp(
     return PomdpPlan(symbolic, hierarchy, solved, flat, seconds, warnings, certified)
 
 
+def solved_pomdp_root(
+    symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
+) -> SolvedPomdpTask:
+    """The tasks of a checked hierarchy solved, and no more than that: the root."""
+    planner, tasks = _Planner(symbolic, hierarchy, options, progress), planning_order(hierarchy)
+    for task in tasks:
+        planner.solve(task)
+    return planner.solved[tasks[-1].name]
+
+
 def refuse_unplannable(model: Model) -> None:
     """Refuse what PolCA+ has no meaning for.
 

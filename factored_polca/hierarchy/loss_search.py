@@ -1,0 +1,63 @@
+"""Plan with the largest epsilon whose bound on the loss of the root's task is small enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+
+from factored_polca.approximation.search import Trial, candidates, largest_within
+from factored_polca.hierarchy.check import checked
+from factored_polca.hierarchy.merging import refuse_unmergeable
+from factored_polca.hierarchy.options import Options
+from factored_polca.hierarchy.plan import HierarchicalPlan, plan_mdp, solved_root
+from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp, refuse_unplannable, solved_pomdp_root
+from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, flat_task
+from factored_polca.symbolic import compile_model
+
+
+def plan_within_loss(
+    model: Model,
+    loss: float,
+    tasks: TaskHierarchy | None = None,
+    options: Options | None = None,
+    *,
+    progress: Callable[[str, str, int, int], None] | None = None,
+) -> tuple[HierarchicalPlan | PomdpPlan, tuple[Trial, ...]]:
+    """The plan with the largest `merge_within` whose root surely loses at most `loss`, and all trials.
+
+    The loss is at the initial belief, in units of reward, against the root's optimum given its children's
+    policies.  Each trial plans the tasks anew.
+
+    Raises:
+        ModelError: the model or the hierarchy is not right; not even exact abstraction promises that.
+        LimitReached: memory, blocks, observations or time.
+    """
+    options = options or Options()
+    refuse_unmergeable(model, options)
+    seen = model.observability == "full" or options.assume_observed
+    if not seen:
+        refuse_unplannable(model)
+    hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
+    symbolic = compile_model(
+        model, order=options.order, tasks=hierarchy, memory_limit=options.memory_limit,
+        deadline=options.deadline,
+    )  # fmt: skip
+    quick = replace(options, flat_block_limit=None)
+
+    def attempt(epsilon: Fraction) -> Trial:
+        chosen = replace(quick, merge_within=epsilon)
+        if progress is not None:
+            progress(f"epsilon {float(epsilon):g}", "plan", 0, 0)
+        solve = solved_root if seen else solved_pomdp_root
+        root = solve(symbolic, hierarchy, chosen, progress)
+        assert root.approximation is not None
+        return Trial(epsilon, root.reduction.partition.blocks, root.approximation.loss)
+
+    found, tried = largest_within(candidates(symbolic, seen=seen), loss, attempt)
+    if found is None:
+        message = f"exact abstraction bounds the root's loss by {tried[0].loss:.3g} only, not by {loss:g}"
+        raise ModelError([Fault(message, (), "give a larger --loss, or solve to a smaller --gap")])
+    final = replace(options, merge_within=found.epsilon)
+    work = plan_mdp if seen else plan_pomdp
+    return work(model, hierarchy, final, progress=progress, symbolic=symbolic), tried
