@@ -217,8 +217,8 @@ def certify_rows(reduction: ApproximateReduction) -> Approximation:
     low, high = value_span(quotient.mdp, len(reduction.process.symbolic.model.features))
     moved = start_error(quotient.pomdp.initial, block_errors(errors, quotient.mdp, high - low))
     note = (
-        f"any policy is worth the same within {moved:.3g} in the model and on its {reduction.partition.blocks:,} "
-        "blocks; to the loss the gap of the solver is to be added"
+        f"any policy is worth the same within {moved:.3g} in the model and on its "
+        f"{reduction.partition.blocks:,} blocks; to the loss the gap of the solver is to be added"
     )
     found = Certificate(-np.inf, np.inf, np.inf, 2 * moved, None, 0.0, note)
     return _approximation(reduction, errors, found)

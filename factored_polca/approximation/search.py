@@ -30,7 +30,7 @@ MOST_ROWS: Final = 100
 
 @dataclass(frozen=True)
 class Trial:
-    """An epsilon that was tried: the blocks of the task and the bound on its loss."""
+    """An epsilon that was tried: the blocks, of all tasks, and the largest bound on the loss of one."""
 
     epsilon: Fraction
     blocks: int

@@ -77,7 +77,7 @@ def print_merging(data: dict[str, Any], output: Output) -> None:
     )  # fmt: skip
     output.table(table)
     output.line(
-        "each task against its best policy given its children's; all: the polled policy against any policy, "
+        "each task against its best policy given its children's; all: the polled policy against any, "
         "hierarchical or not; measured: the exact loss, where the exact quotients are small enough"
     )
 

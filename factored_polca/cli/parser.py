@@ -141,7 +141,7 @@ def parser() -> argparse.ArgumentParser:
         "--interchangeable", action="store_true",
         help="actions count by what they do, not by name (where the state is seen)",
     )  # fmt: skip
-    add_merging(sub, "the root's task")
+    add_merging(sub, "each task, given its children's policies,")
     group = sub.add_argument_group("where the state is not seen")
     group.add_argument(
         "--gap", type=gap, metavar="G",

@@ -178,7 +178,7 @@ def plan_partial(
 def within_loss(
     source: Source, options: Options, loss: float, progress: Callable[[str, str, int, int], None]
 ) -> tuple[Any, dict[str, Any]]:
-    """The plan with the largest epsilon whose root loses at most `loss`, and the figures of what was tried."""
+    """The plan with the largest epsilon whose tasks lose at most `loss`, and the trials' figures."""
     from factored_polca.hierarchy.loss_search import plan_within_loss
 
     found, tried = plan_within_loss(source.model, loss, source.tasks, options, progress=progress)

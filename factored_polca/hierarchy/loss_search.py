@@ -1,4 +1,7 @@
-"""Plan with the largest epsilon whose bound on the loss of the root's task is small enough."""
+"""Plan with the largest epsilon whose bounds on the losses of the tasks are small enough.
+
+The root's own loss is against its optimum given its children's policies; where it has one child to call
+in each state it loses nothing however bad these are.  So the bound is asked of every task. """
 
 from __future__ import annotations
 
@@ -6,14 +9,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 
-from factored_polca.approximation.search import Trial, candidates, largest_within
-from factored_polca.hierarchy.check import checked
-from factored_polca.hierarchy.merging import refuse_unmergeable
-from factored_polca.hierarchy.options import Options
-from factored_polca.hierarchy.plan import HierarchicalPlan, plan_mdp, solved_root
-from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp, refuse_unplannable, solved_pomdp_root
-from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, flat_task
-from factored_polca.symbolic import compile_model
+from factored_polca.approximation.search import Trial, candidates, largest_within from
+factored_polca.hierarchy.check import checked from factored_polca.hierarchy.merging import
+refuse_unmergeable from factored_polca.hierarchy.options import Options from factored_polca.hierarchy.plan
+import HierarchicalPlan, plan_mdp, solved_tasks from factored_polca.hierarchy.pomdp_plan import PomdpPlan,
+plan_pomdp, refuse_unplannable, solved_pomdp_tasks from factored_polca.models import Fault, Model,
+ModelError, TaskHierarchy, flat_task from factored_polca.symbolic import compile_model
 
 
 def plan_within_loss(
@@ -24,10 +25,10 @@ def plan_within_loss(
     *,
     progress: Callable[[str, str, int, int], None] | None = None,
 ) -> tuple[HierarchicalPlan | PomdpPlan, tuple[Trial, ...]]:
-    """The plan with the largest `merge_within` whose root surely loses at most `loss`, and all trials.
+    """The plan with the largest `merge_within` of which each task surely loses at most `loss`, and all trials.
 
-    The loss is at the initial belief, in units of reward, against the root's optimum given its children's
-    policies.  Each trial plans the tasks anew.
+    The loss of a task is at the initial belief, in units of its reward, against its optimum given its
+    children's policies.  Each trial plans the tasks anew.
 
     Raises:
         ModelError: the model or the hierarchy is not right; not even exact abstraction promises that.
@@ -49,14 +50,14 @@ def plan_within_loss(
         chosen = replace(quick, merge_within=epsilon)
         if progress is not None:
             progress(f"epsilon {float(epsilon):g}", "plan", 0, 0)
-        solve = solved_root if seen else solved_pomdp_root
-        root = solve(symbolic, hierarchy, chosen, progress)
-        assert root.approximation is not None
-        return Trial(epsilon, root.reduction.partition.blocks, root.approximation.loss)
+        solve = solved_tasks if seen else solved_pomdp_tasks
+        solved = solve(symbolic, hierarchy, chosen, progress)
+        losses = [one.approximation.loss for one in solved if one.approximation is not None]
+        return Trial(epsilon, sum(one.reduction.partition.blocks for one in solved), max(losses))
 
     found, tried = largest_within(candidates(symbolic, seen=seen), loss, attempt)
     if found is None:
-        message = f"exact abstraction bounds the root's loss by {tried[0].loss:.3g} only, not by {loss:g}"
+        message = f"exact abstraction bounds the tasks' losses by {tried[0].loss:.3g} only, not by {loss:g}"
         raise ModelError([Fault(message, (), "give a larger --loss, or solve to a smaller --gap")])
     final = replace(options, merge_within=found.epsilon)
     work = plan_mdp if seen else plan_pomdp

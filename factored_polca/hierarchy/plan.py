@@ -187,14 +187,14 @@ def plan_mdp(
     )  # fmt: skip
 
 
-def solved_root(
+def solved_tasks(
     symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
-) -> SolvedTask:
-    """The tasks of a checked hierarchy solved, and no more than that: the root."""
-    planner, tasks = _Planner(symbolic, hierarchy, options, progress), planning_order(hierarchy)
-    for task in tasks:
+) -> tuple[SolvedTask, ...]:
+    """The tasks of a checked hierarchy solved, and no more than that; the root comes last."""
+    planner = _Planner(symbolic, hierarchy, options, progress)
+    for task in planning_order(hierarchy):
         planner.solve(task)
-    return planner.solved[tasks[-1].name]
+    return tuple(planner.solved.values())
 
 
 class _Planner:

@@ -150,14 +150,14 @@ def plan_pomdp(
     return PomdpPlan(symbolic, hierarchy, solved, flat, seconds, warnings, certified)
 
 
-def solved_pomdp_root(
+def solved_pomdp_tasks(
     symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
-) -> SolvedPomdpTask:
-    """The tasks of a checked hierarchy solved, and no more than that: the root."""
-    planner, tasks = _Planner(symbolic, hierarchy, options, progress), planning_order(hierarchy)
-    for task in tasks:
+) -> tuple[SolvedPomdpTask, ...]:
+    """The tasks of a checked hierarchy solved, and no more than that; the root comes last."""
+    planner = _Planner(symbolic, hierarchy, options, progress)
+    for task in planning_order(hierarchy):
         planner.solve(task)
-    return planner.solved[tasks[-1].name]
+    return tuple(planner.solved.values())
 
 
 def refuse_unplannable(model: Model) -> None:
