@@ -1,7 +1,7 @@
 """Plan with the largest epsilon whose bounds on the losses of the tasks are small enough.
 
 The root's own loss is against its optimum given its children's policies; where it has one child to call
-in each state it loses nothing however bad these are.  So the bound is asked of every task. """
+in each state it loses nothing however bad these are.  So the bound is asked of every task."""
 
 from __future__ import annotations
 
@@ -9,12 +9,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 
-from factored_polca.approximation.search import Trial, candidates, largest_within from
-factored_polca.hierarchy.check import checked from factored_polca.hierarchy.merging import
-refuse_unmergeable from factored_polca.hierarchy.options import Options from factored_polca.hierarchy.plan
-import HierarchicalPlan, plan_mdp, solved_tasks from factored_polca.hierarchy.pomdp_plan import PomdpPlan,
-plan_pomdp, refuse_unplannable, solved_pomdp_tasks from factored_polca.models import Fault, Model,
-ModelError, TaskHierarchy, flat_task from factored_polca.symbolic import compile_model
+from factored_polca.approximation.search import Trial, candidates, largest_within
+from factored_polca.hierarchy.check import checked
+from factored_polca.hierarchy.merging import refuse_unmergeable
+from factored_polca.hierarchy.options import Options
+from factored_polca.hierarchy.plan import HierarchicalPlan, plan_mdp, solved_tasks
+from factored_polca.hierarchy.pomdp_plan import (
+    PomdpPlan,
+    plan_pomdp,
+    refuse_unplannable,
+    solved_pomdp_tasks,
+)
+from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, flat_task
+from factored_polca.symbolic import compile_model
 
 
 def plan_within_loss(
@@ -25,7 +32,7 @@ def plan_within_loss(
     *,
     progress: Callable[[str, str, int, int], None] | None = None,
 ) -> tuple[HierarchicalPlan | PomdpPlan, tuple[Trial, ...]]:
-    """The plan with the largest `merge_within` of which each task surely loses at most `loss`, and all trials.
+    """The plan with the largest `merge_within` each of whose tasks surely loses at most `loss`; all trials.
 
     The loss of a task is at the initial belief, in units of its reward, against its optimum given its
     children's policies.  Each trial plans the tasks anew.
