@@ -1,7 +1,8 @@
 """Plan with the largest epsilon whose bounds on the losses of the tasks are small enough.
 
 The root's own loss is against its optimum given its children's policies; where it has one child to call
-in each state it loses nothing however bad these are.  So the bound is asked of every task."""
+in each state it loses nothing however bad these are.  So the bound is asked of every task.
+"""
 
 from __future__ import annotations
 
