@@ -60,7 +60,7 @@ def test_where_the_state_is_not_seen_only_distances_of_rows_matter() -> None:
 
 def test_no_task_of_the_plan_that_is_found_loses_more_than_allowed() -> None:
     taxi = load("taxi", {"size": "3", "slip": "true"})
-    found, tried = plan_within_loss(taxi.model, 0.05, taxi.tasks, Options(flat_block_limit=None))
+    found, tried = plan_within_loss(taxi.model, 0.05, options=Options(flat_block_limit=None))
     chosen = {one.approximation.epsilon for one in found.solved if one.approximation is not None}
     assert len(chosen) == 1
     (epsilon,) = chosen

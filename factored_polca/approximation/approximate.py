@@ -87,7 +87,7 @@ class Approximation:
     @property
     def epsilon_text(self) -> str:
         """Epsilon as it may be read again: 0.05 or 1/3."""
-        text = repr(float(self.epsilon))
+        text = f"{float(self.epsilon):g}"
         return text if Fraction(text) == self.epsilon else str(self.epsilon)
 
 

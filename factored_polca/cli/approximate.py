@@ -74,7 +74,8 @@ def minimise_near(
         "optimum_upper": None if process.partial else certain.optimum,
         "policy_lower": None if process.partial else certain.lower,
         "classes": certain.classes,
-        "collision_bound": certain.collision_bound + reduction.minimisation.collision_bound,
+        "collision_bound": certain.collision_bound
+        + (reduction.minimisation.collision_bound if reduction.stable else 0.0),
         "note": certain.note,
         "order": list(symbolic.order),
         **tried,

@@ -16,9 +16,9 @@ from factored_polca.symbolic import SymbolicModel, compile_model
 class TradeOff:
     """A plan with states within `epsilon` merged, its state being seen; losses are in units of reward.
 
-    `blocks` and `root_blocks` are those of all tasks and of the root; `root_loss` is the bound on the root's
-    loss given its children's policies, `task_loss` the largest such bound of any task; `loss` bounds what
-    the polled policy loses against any policy, hierarchical or not; `measured` is that loss, and
+    `blocks` and `root_blocks` are those of all tasks and of the root; `root_loss` is the bound on the
+    root's loss given its children's policies, `task_loss` the largest such bound of any task; `loss` bounds
+    what the polled policy loses against any policy, hierarchical or not; `measured` is that loss, and
     `optimum` the flat optimum, None where the exact quotients are too large.
     """
 
