@@ -77,7 +77,7 @@ def aggregate(
     began = time.perf_counter()
     partition, chance, number = masks(process), 0.0, 0
     while True:
-        classes = find_classes(process, partition, limit=class_limit, seed=seed + number)
+        classes = find_classes(process, partition, limit=class_limit, seed=seed + number, rounds=1)
         chance += classes.collision_bound
         number += 1
         if progress is not None:

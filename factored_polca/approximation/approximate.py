@@ -87,7 +87,7 @@ class Approximation:
     @property
     def epsilon_text(self) -> str:
         """Epsilon as it may be read again: 0.05 or 1/3."""
-        text = repr(float(self.epsilon))
+        text = f"{float(self.epsilon):g}"
         return text if Fraction(text) == self.epsilon else str(self.epsilon)
 
 
@@ -205,6 +205,23 @@ def certify_pomdp(
     note = f"the simulation lemma with the errors of each of {reduction.partition.blocks:,} blocks"
     loss = max(optimum - lower, 0.0)
     return _approximation(reduction, errors, Certificate(lower, optimum, optimum, loss, None, 0.0, note))
+
+
+def certify_rows(reduction: ApproximateReduction) -> Approximation:
+    """What is certain of any policy planned on the quotient, the state not being seen, before it is solved.
+
+    `loss` is twice what the snapped rows may move the value of any policy by, and the quotient's own gap is
+    to be added to it; `lower` and `optimum` are not known.
+    """
+    errors, quotient = reduction.errors(), reduction.pomdp_quotient
+    low, high = value_span(quotient.mdp, len(reduction.process.symbolic.model.features))
+    moved = start_error(quotient.pomdp.initial, block_errors(errors, quotient.mdp, high - low))
+    note = (
+        f"any policy is worth the same within {moved:.3g} in the model and on its "
+        f"{reduction.partition.blocks:,} blocks; to the loss the gap of the solver is to be added"
+    )
+    found = Certificate(-np.inf, np.inf, np.inf, 2 * moved, None, 0.0, note)
+    return _approximation(reduction, errors, found)
 
 
 def _approximation(reduction: ApproximateReduction, errors: Errors, found: Certificate) -> Approximation:

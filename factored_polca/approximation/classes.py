@@ -12,6 +12,8 @@ own are run, so that of K classes two that differ are taken for one with a chanc
 
     K^2 / 2 (B / 60 / 2.7e16 + 2 / 2^60)^2        (B as in `factored_polca.minimisation.refine`).
 
+A partition that only a policy is planned on, and no bound rests on, is found with one round.
+
 A block with its classes is what Givan, Leach & Dean 2000 ("Bounded-parameter Markov decision processes")
 bound by intervals; the classes are the exact set of rows that occur.
 """
@@ -44,7 +46,7 @@ from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 
 ROUNDS = 2
-"""Rounds with a prime of their own."""
+"""Rounds with a prime of their own, where bounds rest on them."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,9 @@ class Classes:
         return initial_distribution(self.refined)[self.order]
 
 
-def refine_once(process: DecisionProcess, partition: Partition, *, limit: int, seed: int = 0) -> Partition:
+def refine_once(
+    process: DecisionProcess, partition: Partition, *, limit: int, seed: int = 0, rounds: int = ROUNDS
+) -> Partition:
     """The states of each block told apart by what each choice earns and where it leads, among blocks.
 
     Raises:
@@ -95,7 +99,7 @@ def refine_once(process: DecisionProcess, partition: Partition, *, limit: int, s
     denominator = common_denominator(process)
     labels = partition.diagram
     try:
-        for number in range(ROUNDS):
+        for number in range(rounds):
             prime = random_prime(randoms)
             while denominator % prime == 0:
                 prime = random_prime(randoms)
@@ -126,13 +130,15 @@ def _split(labels: Diagram, by: Diagram, limit: int) -> Diagram:
     return numbered
 
 
-def find_classes(process: DecisionProcess, partition: Partition, *, limit: int, seed: int = 0) -> Classes:
+def find_classes(
+    process: DecisionProcess, partition: Partition, *, limit: int, seed: int = 0, rounds: int = ROUNDS
+) -> Classes:
     """The classes of `partition` under `process`, both over the unsnapped model.
 
     Raises:
         LimitReached: more than `limit` classes, memory or time.
     """
-    refined = refine_once(process, partition, limit=limit, seed=seed)
+    refined = refine_once(process, partition, limit=limit, seed=seed, rounds=rounds)
     quotient = make_quotient(process, refined)
     states, columns = feature_states(refined), process.symbolic.columns()
     block = evaluate_states(partition.diagram, states, columns).astype(np.int64)
@@ -146,5 +152,5 @@ def find_classes(process: DecisionProcess, partition: Partition, *, limit: int, 
     one = difference_bits(process) / 60 / PRIMES_IN_RANGE + 2 / 2**60
     return Classes(
         process, partition, refined, order, block[order], quotient.mdp.rewards[:, order], transitions,
-        quotient.mdp.applicable[:, order], terminal, len(block) ** 2 / 2 * one**ROUNDS,
+        quotient.mdp.applicable[:, order], terminal, len(block) ** 2 / 2 * one**rounds,
     )  # fmt: skip

@@ -127,6 +127,10 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
         raise UsageError("--certify checks rows of numbers, and --keep-parameters leaves symbols in them")
     source = load(arguments.model, arguments.set, None, names)
     actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
+    if arguments.epsilon is not None or arguments.loss is not None:
+        from factored_polca.cli.approximate import minimise_near
+
+        return minimise_near(arguments, source, actions, output)
     report_warnings(source, output)
     compile_seconds = compile_kernels(output)
     memory, deadline = limits(arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from factored_polca import __version__
+from factored_polca.cli.approximation_arguments import add_merging
 from factored_polca.cli.argument_types import (
     FLAT_TRIALS,
     ORDERS,
@@ -128,6 +129,7 @@ def parser() -> argparse.ArgumentParser:
         "--interchangeable", action="store_true",
         help="actions count by what they do, not by name (where the state is seen)",
     )  # fmt: skip
+    add_merging(sub, "planning on the blocks")
     sub = command("plan", "Plan a task hierarchy: PolCA, or PolCA+ where the state is not seen.")
     with_model(sub)
     with_limits(sub)
@@ -156,6 +158,7 @@ def parser() -> argparse.ArgumentParser:
         "--interchangeable", action="store_true",
         help="actions count by what they do, not by name (where the state is seen)",
     )  # fmt: skip
+    add_merging(sub, "each task, given its children's policies,")
     group = sub.add_argument_group("where the state is not seen")
     group.add_argument(
         "--gap", type=gap, metavar="G",

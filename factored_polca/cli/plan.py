@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from factored_polca.cli.approximation_arguments import print_merging, tried_report
 from factored_polca.cli.commands import (
     compile_kernels,
     limits,
@@ -100,6 +101,7 @@ def options_of(arguments: argparse.Namespace) -> Options:
         trials=arguments.trials,
         assume_observed=arguments.polca,
         interchangeable=arguments.interchangeable,
+        merge_within=arguments.epsilon,
     )
 
 
@@ -131,8 +133,12 @@ def plan_full(
         output.update(f"{task}: {stage}{detail}")
 
     with source.located(), output.progress(f"planning {source.name}"):
-        found = plan_mdp(source.model, source.tasks, options, progress=progress)
-    data = plan_report(found) | figures(arguments, source, compile_seconds)
+        tried: dict[str, Any] = {}
+        if arguments.loss is None:
+            found = plan_mdp(source.model, source.tasks, options, progress=progress)
+        else:
+            found, tried = within_loss(source, options, arguments.loss, progress)
+    data = plan_report(found) | tried | figures(arguments, source, compile_seconds)
     for warning in found.warnings:
         output.warn(warning)
     if arguments.output is not None and arguments.store != "blocks":
@@ -157,6 +163,7 @@ def plan_partial(
 ) -> dict[str, Any]:
     """PolCA+: the figures of the plan, measured, which is written where that is asked for."""
     from factored_polca.hierarchy import plan_pomdp
+    from factored_polca.hierarchy.merging import merging_report
     from factored_polca.hierarchy.pomdp_executable import executable_pomdp
     from factored_polca.hierarchy.pomdp_plan_file import save_pomdp_plan
     from factored_polca.hierarchy.pomdp_report import pomdp_plan_report
@@ -167,9 +174,13 @@ def plan_partial(
         output.update(f"{task}: {stage}{detail}")
 
     with source.located(), output.progress(f"planning {source.name}"):
-        found = plan_pomdp(source.model, source.tasks, options, progress=progress)
+        tried: dict[str, Any] = {}
+        if arguments.loss is None:
+            found = plan_pomdp(source.model, source.tasks, options, progress=progress)
+        else:
+            found, tried = within_loss(source, options, arguments.loss, progress)
         polca = planned_as_seen(source, options, output)
-        policy = executable_pomdp(found)
+        policy = executable_pomdp(found, merging_report(found.root.approximation, found.certified))
         output.update(f"measuring {source.name}")
         measured = measure(
             policy,
@@ -180,7 +191,7 @@ def plan_partial(
                 f"measuring {task}: episodes from {first + 1:,} on, step {step:,}"
             ),
         )
-    data = pomdp_plan_report(found, polca) | measured_figures(found, measured)
+    data = pomdp_plan_report(found, polca) | tried | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:
         output.warn(warning)
@@ -189,12 +200,24 @@ def plan_partial(
     return data
 
 
+def within_loss(
+    source: Source, options: Options, loss: float, progress: Callable[[str, str, int, int], None]
+) -> tuple[Any, dict[str, Any]]:
+    """The plan with the largest epsilon whose tasks lose at most `loss`, and the trials' figures."""
+    from factored_polca.hierarchy.loss_search import plan_within_loss
+
+    found, tried = plan_within_loss(source.model, loss, source.tasks, options, progress=progress)
+    return found, tried_report(tried)
+
+
 def planned_as_seen(source: Source, options: Options, output: Output) -> HierarchicalPlan | None:
     """The same hierarchy planned as if the state were seen, for comparison; None where PolCA can't."""
     from factored_polca.hierarchy import plan_mdp
 
     try:
-        seen = replace(options, assume_observed=True, flat_block_limit=None, solver="auto")
+        seen = replace(
+            options, assume_observed=True, flat_block_limit=None, solver="auto", merge_within=None
+        )
         return plan_mdp(source.model, source.tasks, seen)
     except (ModelError, LimitReached) as error:
         output.note(f"PolCA, for comparison, is left out: {error}")
@@ -261,6 +284,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         if any(" and " in text for text in texts):
             said = "something within these bounds"
         output.line(f"flat optimum: {texts[0]}; the hierarchy costs {said}")
+    print_merging(data, output)
     if "stored" in data:
         stored = data["stored"]
         classes, blocks = f"{stored['classes']:,}", f"{stored['blocks']:,}"
@@ -318,6 +342,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
     else:
         output.line(f"no policy earns more than {data['flat_upper']:.6g} ({escape(data['flat_note'])})")
     output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
+    print_merging(data, output)
     output.line(f"guarantee: {escape(data['guarantee'])}")
 
 

@@ -189,10 +189,18 @@ def plan_mdp(
     flat, note = planner.flat(root)
     warnings = tuple(w for solved in planner.solved.values() for w in solved.warnings)
     seconds = time.perf_counter() - began
-    return HierarchicalPlan(
-        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings,
-        certified,
-    )  # fmt: skip
+    solved = tuple(planner.solved.values())
+    return HierarchicalPlan(symbolic, hierarchy, solved, polled, flat, note, seconds, warnings, certified)
+
+
+def solved_tasks(
+    symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
+) -> tuple[AnySolvedTask, ...]:
+    """The tasks of a checked hierarchy solved, and no more than that; the root comes last."""
+    planner = _Planner(symbolic, hierarchy, options, progress)
+    for task in planning_order(hierarchy):
+        planner.solve(task)
+    return tuple(planner.solved.values())
 
 
 class _Planner:
@@ -421,16 +429,12 @@ def refuse_unavoidable_dead_ends(root: AnySolvedTask) -> None:
         lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
         state = describe_block(root.reduction, int(lost[0])) if len(lost) else None
     if state is not None:
-        raise ModelError(
-            [
-                Fault(
-                    f"from a start state like {state} every policy of task {root.task.name!r} can run into "
-                    "a state that is not terminal and has no applicable action",
-                    ("tasks", root.task.name),
-                    "make such states terminal, add an action, or start elsewhere",
-                )
-            ]
+        message = (
+            f"from a start state like {state} every policy of task {root.task.name!r} can run into a state "
+            "that is not terminal and has no applicable action"
         )
+        hint = "make such states terminal, add an action, or start elsewhere"
+        raise ModelError([Fault(message, ("tasks", root.task.name), hint)])
 
 
 def total_counts(solved: Mapping[str, AnySolvedTask] | Sequence[AnySolvedTask]) -> QValueCounts:

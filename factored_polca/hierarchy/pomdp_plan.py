@@ -150,6 +150,16 @@ def plan_pomdp(
     return PomdpPlan(symbolic, hierarchy, solved, flat, seconds, warnings, certified)
 
 
+def solved_pomdp_tasks(
+    symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
+) -> tuple[SolvedPomdpTask, ...]:
+    """The tasks of a checked hierarchy solved, and no more than that; the root comes last."""
+    planner = _Planner(symbolic, hierarchy, options, progress)
+    for task in planning_order(hierarchy):
+        planner.solve(task)
+    return tuple(planner.solved.values())
+
+
 def refuse_unplannable(model: Model) -> None:
     """Refuse what PolCA+ has no meaning for.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from factored_polca.approximation.approximate import Approximation
 from factored_polca.hierarchy.irrelevance import KINDS, value_classes
 from factored_polca.hierarchy.merging import approximation_report, merging_report, merging_text
 from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
@@ -25,7 +24,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
         "flat_blocks": None if plan.flat is None else plan.flat.blocks,
         "flat_note": plan.flat_note,
         "guarantee": guarantee(plan),
-        **merging_report(approximation_of(plan.root), plan.certified),
+        **merging_report(plan.root.approximation, plan.certified),
         "tasks": [
             {
                 "name": solved.task.name,
@@ -45,7 +44,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "seconds": solved.seconds,
                 "nodes": solved.solution.nodes if isinstance(solved, StructuredTask) else None,
                 "note": solved.solution.note if isinstance(solved, StructuredTask) else "",
-                **approximation_report(approximation_of(solved)),
+                **approximation_report(solved.approximation),
             }
             for solved in plan.solved
         ],
@@ -69,19 +68,14 @@ def classes_by_kind(solved: AnySolvedTask) -> dict[str, int]:
     return {kind: value_classes(solved, kind).classes for kind in KINDS if not (exchanged and kind == "q")}
 
 
-def approximation_of(solved: AnySolvedTask) -> Approximation | None:
-    """What is certain where near states were merged; None where they were not."""
-    return None if isinstance(solved, StructuredTask) else solved.approximation
-
-
 def guarantee(plan: HierarchicalPlan) -> str:
     """How far the value may be trusted, in words."""
     width = plan.polled.upper - plan.polled.lower
     gap = max(solved.gap for solved in plan.solved)
     bounds = [collision_bound(solved) for solved in plan.solved]
     chance = sum(bound for bound in bounds if bound is not None)
-    if (approximation := approximation_of(plan.root)) is not None:
-        return merging_text(approximation, plan.certified)
+    if plan.root.approximation is not None:
+        return merging_text(plan.root.approximation, plan.certified)
     names = [solved.task.name for solved in plan.solved if isinstance(solved, StructuredTask)]
     partitions = f"each partition exact but for a chance below {max(chance, 1e-300):.1g}"
     if len(names) == len(plan.solved):

@@ -121,6 +121,11 @@ class StructuredTask(DrawnGraph):
         return self.solution.choices
 
     @property
+    def approximation(self) -> None:
+        """Near states are merged in blocks only."""
+        return
+
+    @property
     def blocks(self) -> None:
         """There are none."""
         return
