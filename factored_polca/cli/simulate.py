@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from factored_polca.cli.output import Output, escape
+from factored_polca.cli.simulate_symbolic import simulate_alpha_policy
 
 if TYPE_CHECKING:
     from factored_polca.cli.pilot import AnyPlan
@@ -21,10 +22,13 @@ EPISODES = 1000
 def simulate(arguments: argparse.Namespace, output: Output) -> int:
     """Run a plan or a policy on the original model."""
     from factored_polca.cli.pilot import open_plan
+    from factored_polca.hierarchy.alpha_policy_file import is_alpha_policy_file
     from factored_polca.hierarchy.policy_file import is_policy_file
 
     if is_policy_file(arguments.plan):
         data = simulate_policy_file(arguments, output)
+    elif is_alpha_policy_file(arguments.plan):
+        data = simulate_alpha_policy(arguments, output)
     else:
         plan = open_plan(arguments.plan)
         partial = plan.model.observability == "partial"

@@ -13,14 +13,16 @@ import numpy as np
 
 from factored_polca.cli.commands import (
     compile_kernels,
-    peak_memory_bytes,
+    limits,
     refuse_unwritable,
     report_warnings,
 )
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
+from factored_polca.cli.solve_symbolic import SYMBOLIC, solve_on_diagrams
 from factored_polca.cli.source import Source, UsageError, load
-from factored_polca.models import Model
+from factored_polca.models import LimitReached, Model
 from factored_polca.models.model import replace_fields
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ MDP_METHODS: Final = {
     "vi": "value iteration",
     "pi": "policy iteration",
     "mpi": "modified policy iteration",
+    "structured": "structured value iteration",
 }
 STAGED: Final = ("auto", "exact", "witness")
 """POMDP solvers that take a horizon."""
@@ -91,6 +94,7 @@ class Found:
 
 def solve(arguments: argparse.Namespace, output: Output) -> int:
     """Solve a model as it is, print bounds and what they mean, write the policy."""
+    from factored_polca.cli.solve_large import listed_unless_large, solve_large
     from factored_polca.hierarchy.policy_file import FlatPolicy, save_policy
     from factored_polca.symbolic import compile_model
 
@@ -99,10 +103,20 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set)
     task = checked_task(source, arguments)
     report_warnings(source, output)
+    if task.solver == SYMBOLIC:
+        return solve_on_diagrams(task, source, arguments, output)
     compile_seconds = warm(task, output)
     began = time.perf_counter()
-    with source.located(), output.progress(f"listing the states of {source.name}"):
-        flat = listed(compile_model(task.model), task)
+    try:
+        with source.located(), output.progress(f"listing the states of {source.name}"):
+            symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
+            flat = listed_unless_large(symbolic, task)
+    except LimitReached as error:
+        if task.solver != "auto" or task.as_mdp or task.model.horizon is not None:
+            raise
+        return solve_on_diagrams(task, source, arguments, output, f"not listed: {error}")
+    if isinstance(flat, str):
+        return solve_large(symbolic, task, flat, source, arguments, output, compile_seconds)
     build_seconds = time.perf_counter() - began
     with output.progress(f"solving {source.name}"):
         found, compiled = work(task, flat, source, output)

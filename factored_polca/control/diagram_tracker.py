@@ -9,7 +9,7 @@ action a changes, the channels' factors w_j(x, x') = P_a(o_j | x', x) at the val
 Features that a does not change need no copy: wherever x_i' is read, x_i stands in its place.  An
 observed feature is fixed to what is seen, and a factor by itself.  The present variables are summed out
 one by one, that one first whose factors together test the fewest variables; factors that do not read it
-wait (variable elimination: Zhang & Poole 1996; on diagrams: Hoey, St-Aubin, Hu & Boutilier 1999).  What
+wait (variable elimination, `factored_polca.symbolic.elimination`).  What
 is left is multiplied together where it shares variables.
 
 Sums in another order differ in their last bits, and a diagram tells such numbers apart.  So leaves that
@@ -22,13 +22,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.control.factors import Factor, mass, merge, push_down, restricted
 from factored_polca.control.received import Received
 from factored_polca.control.tracker import (
     NODE_LIMIT,
@@ -52,13 +50,13 @@ from factored_polca.diagrams import (
     node_count,
     relabel,
     states_for_leaves,
-    sum_out,
     support,
-    weighted_sum,
 )
 from factored_polca.minimisation import Partition
 from factored_polca.models import LimitReached, ModelError, Value
 from factored_polca.symbolic import NumericView, RowDiagram, SymbolicModel
+from factored_polca.symbolic.elimination import eliminate, joined
+from factored_polca.symbolic.factors import Factor, mass, merge, push_down, restricted
 
 BYTES_PER_NODE: Final = 1_000
 """Room that an operation may take for each node of the limit: results, tables, what comes between."""
@@ -109,7 +107,7 @@ class DiagramTracker(Tracker):
             live += [self.channel(action, j, value) for j, value in sensed]
             fixed = {symbolic.next(i): value for i, value in told.items() if i in changed}
             live = [restricted(factor, fixed) for factor in live]
-            live = self._eliminate(live, {symbolic.now(i) for i in changed})
+            live = eliminate(live, {symbolic.now(i) for i in changed}, self._fits)
             return self.finish(live, changed, received)
 
     def finish(self, live: list[Factor], changed: Collection[int], received: Received) -> DiagramBelief:
@@ -125,14 +123,14 @@ class DiagramTracker(Tracker):
         ]
         told = zip(self.reader.observed, received.seen, strict=True)
         fixed = {symbolic.now(i): value for i, value in told}
-        factors = self._joined([restricted(f, fixed) for f in moved])
+        factors = joined([restricted(f, fixed) for f in moved], self._fits)
         for level, value in fixed.items():
             known = choose(manager.indicator(level, [value]), self.one, self.zero)
             factors.append(Factor(known, frozenset([level])))
         wrong = ~symbolic.terminal if received.ended else symbolic.terminal
         if mass(wrong, factors):
             right = choose(wrong, self.zero, self.one)
-            factors = self._joined([*factors, self._scoped(right)])
+            factors = joined([*factors, self._scoped(right)], self._fits)
         chance = 1.0
         normalised: list[Factor] = []
         for factor in factors:
@@ -197,50 +195,6 @@ class DiagramTracker(Tracker):
             row = self.symbolic.actions[action].observations[channel]
             self._channels[key] = self._scoped(self._same(self._chance(row, value), action))
         return self._channels[key]
-
-    # -- products and sums -----------------------------------------------------------------------
-
-    def _eliminate(self, live: list[Factor], levels: Collection[int]) -> list[Factor]:
-        """Sum `levels` out of the product of `live`: the one with the fewest variables first."""
-        width = {level: _width(live, level) for level in levels}
-        while width:
-            level = min(width, key=lambda level: (width[level], level))
-            del width[level]
-            touched = [factor for factor in live if level in factor.scope]
-            live = [factor for factor in live if level not in factor.scope]
-            live.append(self._sum_product(touched, level))
-            for other in live[-1].scope & width.keys():
-                width[other] = _width(live, other)
-        return live
-
-    def _sum_product(self, touched: list[Factor], level: int) -> Factor:
-        """The sum over one variable of a product of factors."""
-        scope = frozenset().union(*(factor.scope for factor in touched)) - {level}
-        ordered = sorted((factor.diagram for factor in touched), key=node_count)
-        if len(ordered) == 1:
-            return Factor(self._fits(sum_out(ordered[0], level)), scope)
-        seen = [cofactors(diagram, level) for diagram in ordered]
-        weights = [reduce(self._times, parts) for parts in zip(*seen[:-1], strict=True)]
-        return Factor(self._fits(weighted_sum(weights, seen[-1])), scope)
-
-    def _times(self, a: Diagram, b: Diagram) -> Diagram:
-        return self._fits(a * b)
-
-    def _joined(self, factors: list[Factor]) -> list[Factor]:
-        """The same product with factors that share variables multiplied together."""
-        groups: dict[int, list[Factor]] = {}
-        owner: dict[int, int] = {}  # level -> group
-        for number, factor in enumerate(factors):
-            groups[number] = [factor]
-            for group in sorted({owner[level] for level in factor.scope if level in owner}):
-                groups[number] += groups.pop(group)
-            owner.update((level, number) for member in groups[number] for level in member.scope)
-        result = []
-        for members in groups.values():
-            together = sorted((member.diagram for member in members), key=node_count)
-            scope = members[0].scope.union(*(member.scope for member in members))
-            result.append(Factor(reduce(self._times, together), scope))
-        return result
 
     # -- limits ----------------------------------------------------------------------------------
 
@@ -312,11 +266,6 @@ class DiagramBelief(Belief):
             levels = sorted(factor.scope)
             digits[levels] = states[np.lexsort(states.T[::-1])[0]][levels]
         return self.tracker.state(digits[self.tracker.symbolic.now_levels])
-
-
-def _width(factors: Sequence[Factor], level: int) -> int:
-    """How many variables the factors of a variable have."""
-    return len(set().union(*(factor.scope for factor in factors if level in factor.scope)))
 
 
 def try_history(tracker: DiagramTracker, history: Sequence[Received]) -> int:

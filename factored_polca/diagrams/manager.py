@@ -8,6 +8,7 @@ Ctrl-C (Python raises it there), for `abort()` called by another thread, and for
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -46,6 +47,22 @@ class Aborted(RuntimeError):
 
 
 def available_memory() -> int:
+    """Bytes of memory that this process may still take: what is free, or less where it has a limit."""
+    free = _free_memory()
+    try:
+        import resource  # not everywhere
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
+        if limit == resource.RLIM_INFINITY:
+            return free
+        with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+            taken = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData:"))
+    except (ImportError, OSError, StopIteration):
+        return free
+    return max(0, min(free, limit - taken))
+
+
+def _free_memory() -> int:
     """Bytes of memory that are free now, or 4 GiB where the system does not say."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
@@ -172,6 +189,10 @@ class Manager:
     def field_number(self, field: Field) -> int:
         """A small number for a field, for keys of caches."""
         return self._fields.setdefault(field.prime, len(self._fields) + 1)
+
+    def step_number(self, step: float) -> int:
+        """As `field_number`, for floats that are rounded to multiples of a power of 2."""
+        return self._fields.setdefault(-round(2000 + math.log2(step)), len(self._fields) + 1)
 
     def cache_key(self, *parts: Hashable) -> int:
         """A number for what `parts` name, to mark entries of `cache`; operators' keys are positive."""

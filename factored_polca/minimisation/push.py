@@ -186,6 +186,10 @@ def _plain_plan(symbolic: SymbolicModel, diagram: Diagram) -> PushPlan:
     )  # fmt: skip
 
 
+ExactRow = tuple[tuple[int, Fraction], ...]
+"""The values of a feature that have a positive probability, with it."""
+
+
 @dataclass(frozen=True)
 class RowTable:
     """Rows of many features as flat lists of (value, probability), positive entries only."""
@@ -193,13 +197,19 @@ class RowTable:
     start: Int64Array  # [row]
     value: Int32Array
     probability: FloatArray
-    exact: tuple[tuple[tuple[int, Fraction], ...], ...]
+    exact: tuple[ExactRow, ...]
     offset: dict[int, int]  # feature -> number of its first row; persisting features: rows by value
 
 
-def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTable:
-    """All rows of an action: of its row diagrams, and unit rows for features that persist."""
-    exact: list[tuple[tuple[int, Fraction], ...]] = []
+def exact_rows(
+    symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]
+) -> tuple[tuple[ExactRow, ...], dict[int, int]]:
+    """All rows of an action: of its row diagrams, and unit rows for features that persist.
+
+    Returns:
+        the rows; feature -> the number of its first one.
+    """
+    exact: list[ExactRow] = []
     offset: dict[int, int] = {}
     for feature, definition in enumerate(symbolic.model.features):
         offset[feature] = len(exact)
@@ -207,10 +217,16 @@ def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTab
             exact += [tuple((v, q) for v, q in enumerate(row) if q) for row in rows[feature].rows]
         else:
             exact += [((v, Fraction(1)),) for v in range(len(definition.values))]
+    return tuple(exact), offset
+
+
+def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTable:
+    """All rows of an action, as `exact_rows` lists them."""
+    exact, offset = exact_rows(symbolic, rows)
     start = np.concatenate([[0], np.cumsum([len(row) for row in exact])]).astype(np.int64)
     value = np.array([v for row in exact for v, _ in row], dtype=np.int32)
     probability = np.array([float(q) for row in exact for _, q in row], dtype=np.float64)
-    return RowTable(start, value, probability, tuple(exact), offset)
+    return RowTable(start, value, probability, exact, offset)
 
 
 def rows_at(

@@ -215,11 +215,15 @@ class _Refinement:
             self.polynomial = Polynomial(self.view, field, self.generator)
 
     def new_view(self, field: Field) -> ProcessView:
-        """The process in a field, with fresh draws for observations."""
-        numbers = NumericView(self.process.symbolic, field)
-        channels = self.process.channels
-        sensed = None if not channels else SensedRegression(numbers, channels, self.generator)
-        return ProcessView(self.process, numbers, sensed)
+        """The process in a field, with fresh draws for observations and for parameters kept as symbols."""
+        process = self.process
+        if process.open_numbers is not None:
+            process = process.open_numbers.draw(self.random, field.prime)
+        numbers = NumericView(process.symbolic, field)
+        sensed = (
+            None if not process.channels else SensedRegression(numbers, process.channels, self.generator)
+        )
+        return ProcessView(process, numbers, sensed)
 
     def run(self, confirmations: int) -> None:
         self.begin()
@@ -414,7 +418,11 @@ class _Refinement:
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
         degree = 3 + len(self.process.channels or ())
-        bits = difference_bits(self.process)
+        open_numbers = self.process.open_numbers
+        if open_numbers is None:
+            bits = difference_bits(self.process)
+        else:
+            degree, bits = degree + open_numbers.degree, open_numbers.bits
         if self.interchangeable:  # a product over the choices
             degree, bits = degree * len(self.process.choices), bits * len(self.process.choices)
         return bits / 60 / PRIMES_IN_RANGE + degree / 2**60

@@ -19,12 +19,13 @@ taken, or behind a deciding `and`/`or`, is harmless.  All numbers are rationals.
 from __future__ import annotations
 
 import numbers
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any, Final
 
+from factored_polca.models.rational_functions import RationalFunction
 from factored_polca.models.scalars import OPERATORS, Scalar, Undefined, Value, apply_operator
 
 
@@ -276,6 +277,8 @@ def as_expression(thing: ExpressionLike) -> Expression:
         return thing
     if isinstance(thing, bool):
         return Constant(thing)
+    if isinstance(thing, RationalFunction):
+        return Constant(thing)
     if isinstance(thing, numbers.Rational):
         return Constant(Fraction(int(thing.numerator), int(thing.denominator)))
     if isinstance(thing, float):
@@ -304,16 +307,22 @@ def as_expression(thing: ExpressionLike) -> Expression:
 
 def operation(name: str, *arguments: ExpressionLike) -> Expression:
     """Operator `name` on `arguments`: nested associative operators are flattened, constants folded."""
-    row = OPERATORS[name]
     parts = [as_expression(argument) for argument in arguments]
-    if row.associative:
+    if OPERATORS[name].associative:
         flat: list[Expression] = []
         for part in parts:
             if isinstance(part, Operation) and part.operator == name:
                 flat.extend(part.arguments)
             else:
                 flat.append(part)
-        parts = _fold_start(name, flat)
+        parts = flat
+    return grouped(name, parts)
+
+
+def grouped(name: str, parts: Sequence[Expression]) -> Expression:
+    """Operator `name` on `parts` as they are bracketed; constants are folded."""
+    if OPERATORS[name].associative:
+        parts = _fold_start(name, parts)
         if len(parts) == 1:
             return parts[0]
     constants = [part.value for part in parts if isinstance(part, Constant)]
@@ -324,7 +333,7 @@ def operation(name: str, *arguments: ExpressionLike) -> Expression:
     return Operation(name, tuple(parts))
 
 
-def _fold_start(name: str, parts: list[Expression]) -> list[Expression]:
+def _fold_start(name: str, parts: Sequence[Expression]) -> list[Expression]:
     """`parts` with the constants at its start combined, as reading from left to right does."""
     first, rest = parts[0], 1
     while rest < len(parts):
