@@ -5,24 +5,21 @@ function of the manager's variables.  Knows nothing of models.
 """
 
 from factored_polca.diagrams.diagram import Diagram
+from factored_polca.diagrams.elimination import argmax, argmax_out, max_out, sum_out
 from factored_polca.diagrams.field import MERSENNE_61, Field, is_prime, random_prime
 from factored_polca.diagrams.leaves import FLOAT, INDEX, LeafType
 from factored_polca.diagrams.manager import Aborted, Manager, MemoryLimit
 from factored_polca.diagrams.operations import (
     apply,
-    argmax,
-    argmax_out,
     choose,
     cofactors,
     combine,
-    max_out,
     move,
     pairs,
     relabel,
     renumber,
     restrict,
     substitute_leaves,
-    sum_out,
     support,
     weighted_sum,
 )

@@ -7,7 +7,6 @@ others that do).  All raise `MemoryLimit` when the store may not grow and `Abort
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from factored_polca.diagrams.apply import apply_binary
 from factored_polca.diagrams.apply import choose as choose_kernel
 from factored_polca.diagrams.diagram import Diagram
 from factored_polca.diagrams.field import Field
-from factored_polca.diagrams.leaves import FLOAT, INDEX, FloatLeaves, LeafType, payloads
+from factored_polca.diagrams.leaves import INDEX, FloatLeaves, LeafType, payloads
 from factored_polca.diagrams.manager import Manager, require
 from factored_polca.diagrams.nodes import STEPS, Int32Array, add_node
 from factored_polca.diagrams.operators import OPERATORS, Kind, OperatorRow
@@ -410,30 +409,3 @@ def cofactors(diagram: Diagram, level: int) -> list[Diagram]:
     manager.safe_point()
     walk = Walk(diagram)
     return [walk.with_levels({level: v}, {}) for v in range(manager.sizes[level])]
-
-
-def sum_out(diagram: Diagram, level: int) -> Diagram:
-    """The sum over the values of the variable at `level`; for conditions their disjunction."""
-    name = "or" if diagram.leaf_type == INDEX else "plus"
-    return reduce(lambda a, b: apply(name, a, b), cofactors(diagram, level))
-
-
-def max_out(diagram: Diagram, level: int) -> Diagram:
-    """The maximum over the values of the variable at `level` (float leaves)."""
-    return reduce(lambda a, b: apply("maximum", a, b), cofactors(diagram, level))
-
-
-def argmax_out(diagram: Diagram, level: int) -> Diagram:
-    """The first value of the variable at `level` that attains the maximum (float leaves)."""
-    return argmax(cofactors(diagram, level))
-
-
-def argmax(candidates: Sequence[Diagram]) -> Diagram:
-    """The index of the first of several float diagrams that is largest, pointwise."""
-    manager = require(candidates, FLOAT)
-    best, index = candidates[0], manager.constant(0)
-    for number, candidate in enumerate(candidates[1:], start=1):
-        better = apply("less", best, candidate)
-        index = choose(better, manager.constant(number), index)
-        best = choose(better, candidate, best)
-    return index
