@@ -75,6 +75,16 @@ def test_expected_rewards_are_those_of_the_state_and_the_action() -> None:
     assert environment.step(0)[1] == pytest.approx(-1.25)
 
 
+@pytest.mark.parametrize("rewards", ["sampled", "expected"])
+def test_a_reward_that_no_float_holds_is_refused(rewards: Any) -> None:
+    on = boolean("on")
+    model = Model("huge", [on], [Action("go", {on: True})], rewards=[10**399], initial={on: False})
+    environment = ModelEnvironment(model, rewards=rewards)
+    environment.reset(seed=0)
+    with pytest.raises(ModelError, match=r"there is a reward beyond 10\^200"):
+        environment.step(0)
+
+
 def test_a_horizon_and_dead_ends_truncate() -> None:
     environment = ModelEnvironment(corridor(horizon=2))
     environment.reset(seed=0)

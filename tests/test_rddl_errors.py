@@ -98,6 +98,7 @@ def at(text: str, part: str) -> tuple[int, int]:
          "the horizon is 0: it is a whole number of steps from 1 on, or pos-inf", ""),
         (rddl(X + A, "x' = x;", discount="discount = 1.5;"), "the discount is not between 0 and 1", ""),
         (rddl(X + A, "x' = " + "~" * 400 + "x;"), "an expression is nested deeper than 150 levels", ""),
+        (rddl(X + A, "x' = x;", "9" * 5000), "a number of more than 1000 digits", "9999"),
         (rddl(X + A, "x' = x;", "0." + "1" * 2000), "a number of more than 1000 digits", "0.1"),
     ],
 )  # fmt: skip

@@ -22,6 +22,7 @@ from factored_polca.explicit.evaluate import distribution, evaluate
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.exact_pomdp import enumerate_pomdp
 from factored_polca.explicit.minimiser import minimise
+from factored_polca.formats import read_native, write_native
 from factored_polca.formats.spudd import read_spudd, read_spudd_with_warnings, write_spudd
 from factored_polca.models import (
     Action,
@@ -718,3 +719,15 @@ def test_the_published_coffee_pomdp_is_normalised_as_its_comments_say(data: Path
     # the robot can get wet from spilling only if it got the coffee just now: a synchronic arc
     assert Reference("hrc", primed=True) in references(dict(model.action("buyc_fast").effects)["w"])
     assert read_spudd(write_spudd(model), "coffee") == model
+
+
+def test_products_of_products_keep_their_brackets_in_the_native_format() -> None:
+    trees = "(x (a (3)) (b (2)))", "(y (c (5)) (d (1)))", "(y (c (7)) (d (11)))"
+    reward = f"[* 2 3 [* {trees[0]} {trees[1]}] [+ 1 4 [+ {trees[2]} {trees[0]}]]]"
+    text = small("action go x (SAMEx) y (SAMEy) endaction reward " + reward)
+    model = read_spudd(text, "test")
+    back = read_native(write_native(model)).model
+    assert back == model
+    earned = [float(r) for r in enumerate_model(back).rewards[0]]
+    x, y, z = {"a": 3, "b": 2}, {"c": 5, "d": 1}, {"c": 7, "d": 11}
+    assert earned == [6 * x[u] * y[v] * (5 + z[v] + x[u]) for u in "ab" for v in "cd"]

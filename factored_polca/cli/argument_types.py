@@ -12,7 +12,7 @@ FLAT_TRIALS = 300
 ORDERS = ("auto", "file", "force", "spectral")
 FLAT_SOLVERS = (
     "auto", "exact", "witness", "pbvi", "perseus", "hsvi", "sarsop", "qmdp", "fib", "blind", "amdp", "vi",
-    "pi", "mpi", "symbolic",
+    "pi", "mpi", "structured", "symbolic",
 )  # fmt: skip
 
 

@@ -46,12 +46,14 @@ SOLVE_NOTES = """solvers:
   symbolic  partially observed models, on diagrams: no state is listed; auto takes it for models with too
             many states to list
   vi, pi, mpi                   fully observed models: value, policy, modified policy iteration
+  structured                    fully observed models, without listing states: value iteration on diagrams
   package.module:Name           any solver that can be called as factored_polca.solvers.protocol says;
                                 the module is imported, so name only what you trust
 
 --gap and --epsilon are one thing: upper - lower at the start.  Without them 0.001, for exact 1e-6; fully
 observed models are solved to 1e-9 of the largest value.  There is no time limit but --time, which counts
-the solving only.  Only states that the start can reach are listed.
+the solving only.  Only states that the start can reach are listed.  Where these are too many, auto solves a
+fully observed model over the blocks of its quotient, and where those are too many on diagrams.
 
 exit status: 0 with a result, also where --time or --iterations stopped the solver; 130 after Ctrl-C, with
 the result so far printed and written if there is one; 3 where memory or another limit was reached.
@@ -129,8 +131,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     sub.add_argument(
         "--solver", default="auto", type=solver, metavar="NAME",
-        help="for tasks that name none: vi, pi, mpi where the state is seen, else any that solve has; or "
-        "package.module:Name, which is imported",
+        help="for tasks that name none: vi, pi, mpi, structured where the state is seen, else any that "
+        "solve has; or package.module:Name, which is imported",
     )  # fmt: skip
     sub.add_argument("--no-flat", action="store_true", help="leave out the flat optimum")
     sub.add_argument(
@@ -214,6 +216,7 @@ def add_solving(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--gap", type=gap, metavar="G", help="stop at upper - lower <= G at the start")
     sub.add_argument("--epsilon", type=gap, metavar="E", help="the same as --gap")
     sub.add_argument("--time", type=positive, metavar="SECONDS", help="solve no longer than that")
+    sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit of diagrams, such as 2GB")
     sub.add_argument("--iterations", type=counting, metavar="N", help="no more than N of the solver's")
     sub.add_argument(
         "--horizon", type=horizon, metavar="H", help="steps, or infinite; the model's if not given"

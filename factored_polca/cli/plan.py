@@ -209,17 +209,21 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     for row in data["tasks"]:
         value = "none" if row["value"] == -math.inf else f"{row['value']:.6g}"
         table.add_row(
-            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}", f"{row['q_values']:,}",
-            f"{row['q_classes']:,}", f"{row['q_classes_shared']:,}", value, seconds(row["seconds"]),
+            escape(row["name"]), f"{len(row['actions'])}",
+            *(counted(row[key]) for key in ("blocks", "q_values", "q_classes", "q_classes_shared")),
+            value, seconds(row["seconds"]),
         )  # fmt: skip
     table.add_section()
     total = data["totals"]
     table.add_row(
-        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", f"{total['q_values']:,}",
+        "all", "", f"{sum(row['blocks'] or 0 for row in data['tasks']):,}", f"{total['q_values']:,}",
         f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
     output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
+    for row in data["tasks"]:
+        if row["blocks"] is None:
+            output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
     output.line(f"value of the hierarchical policy from the start: [bold]{data['value']:.9g}[/]")
     if data["flat_value"] is None:
         output.line(f"flat optimum: {escape(data['flat_note'])}")
@@ -228,6 +232,11 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
         output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def counted(count: int | None) -> str:
+    """A count; a dash where there are no blocks."""
+    return "-" if count is None else f"{count:,}"
 
 
 def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:

@@ -16,8 +16,11 @@ def print_solution(data: Mapping[str, Any], arguments: argparse.Namespace, outpu
     table.show_header = False
     table.add_row("method", escape(data["method"]))
     table.add_row("states", big(data["states"]))
-    if data["reachable_states"] != data["states"]:
+    listed = data["reachable_states"] is not None
+    if listed and data["reachable_states"] != data["states"]:
         table.add_row("of them reachable", f"{data['reachable_states']:,}")
+    if data["blocks"] is not None:
+        table.add_row("blocks", f"{data['blocks']:,}")
     table.add_row("actions", f"{data['actions']:,}")
     if data["observations"] is not None:
         table.add_row("observations", f"{data['observations']:,}")
@@ -27,7 +30,8 @@ def print_solution(data: Mapping[str, Any], arguments: argparse.Namespace, outpu
         table.add_row("size of the policy", f"{data['vectors']:,}")
     table.add_row("iterations", f"{data['iterations']:,}")
     table.add_row("time", seconds(data["seconds"]))
-    table.add_row("states listed in", seconds(data["build_seconds"]))
+    if listed:
+        table.add_row("states listed in", seconds(data["build_seconds"]))
     table.add_row("kernels loaded or compiled", seconds(data["compile_seconds"]))
     table.add_row("peak memory", f"{data['peak_memory_bytes'] / 2**20:,.0f} MiB")
     output.table(table)

@@ -8,6 +8,7 @@ Ctrl-C (Python raises it there), for `abort()` called by another thread, and for
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -169,6 +170,12 @@ class Manager:
     def field_number(self, field: Field) -> int:
         """A small number for a field, for keys of caches."""
         return self._fields.setdefault(field.prime, len(self._fields) + 1)
+
+    def step_number(self, step: float) -> int:
+        """As `field_number`, for floats that are rounded to multiples of a power of 2 (0: they are not)."""
+        if not step:
+            return 0
+        return self._fields.setdefault(-round(2000 + math.log2(step)), len(self._fields) + 1)
 
     def cache_key(self, *parts: Hashable) -> int:
         """A number for what `parts` name, to mark entries of `cache`; operators' keys are positive."""

@@ -366,12 +366,16 @@ def choose(condition: Diagram, then: Diagram, otherwise: Diagram) -> Diagram:
     return manager.handle(int(manager.results[0]), then.leaf_type)
 
 
-def sum_options(manager: Manager, leaf_type: LeafType, normalised: bool) -> npt.NDArray[np.int64]:
-    """The options that weighted sums over `leaf_type` pass to their kernels."""
-    is_field = isinstance(leaf_type, Field)
-    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else 0
+def sum_options(
+    manager: Manager, leaf_type: LeafType, normalised: bool, step: float = 0.0
+) -> npt.NDArray[np.int64]:
+    """The options of weighted sums; sums of floats become multiples of `step`, a power of 2, unless it is 0."""
+    is_field, number = isinstance(leaf_type, Field), manager.step_number(step)
+    if isinstance(leaf_type, Field):
+        number = manager.field_number(leaf_type)
     zero, one = manager.constant(0, leaf_type), manager.constant(1, leaf_type)
-    values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field]
+    bits = int(np.float64(step).view(np.int64))
+    values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field, bits]
     return np.array(values, dtype=np.int64)
 
 

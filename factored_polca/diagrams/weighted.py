@@ -47,8 +47,9 @@ from factored_polca.diagrams.nodes import (
     payload,
 )
 
-ZERO, ONE, NORMALISED, MARK, IS_FLOAT = range(5)
-"""Places in `options`: the leaves 0 and 1, whether the weights sum to 1, the mark, the leaf type."""
+ZERO, ONE, NORMALISED, MARK, IS_FLOAT, STEP = range(6)
+"""Places in `options`: the leaves 0 and 1, whether the weights sum to 1, the mark, the leaf type, and the
+bits of a float that sums of floats are rounded to multiples of (0: they are not)."""
 
 _LOW = np.uint64(0xFFFFFFFF)
 _S32 = np.uint64(32)
@@ -162,6 +163,9 @@ def settle(
         for j in range(kept):
             weight = np.uint64(payload(pool, terms[base + 2 * j])).view(np.float64)
             total += weight * np.uint64(payload(pool, terms[base + 2 * j + 1])).view(np.float64)
+        if options[STEP] != 0:
+            step = np.int64(options[STEP]).view(np.float64)
+            total = np.rint(total / step) * step
         value = float_payload(total)
     else:
         for j in range(kept):

@@ -23,6 +23,7 @@ DRAWN_BY: Final = {
     "minimisation.quotient.Quotient": "quotient_view",
     "minimisation.pomdp_quotient.PomdpQuotient": "quotient_view",
     "hierarchy.solved.SolvedTask": "task_view",
+    "hierarchy.solved.StructuredTask": "task_view",
     "hierarchy.executable.TaskPolicy": "task_view",
     "hierarchy.pomdp_solved.SolvedPomdpTask": "belief_task_view",
     "hierarchy.policy_file.FlatPolicy": "flat_policy_view",

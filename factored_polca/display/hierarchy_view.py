@@ -95,7 +95,8 @@ def plan_graph(plan: Any) -> Graph:
 
 def facts(row: Mapping[str, Any]) -> list[str]:
     """What is known of a solved task, for its box."""
-    lines = [f"{plural(row['blocks'], 'block')}, {row['solver']}"]
+    size = "no blocks" if row["blocks"] is None else plural(row["blocks"], "block")
+    lines = [f"{size}, {row['solver']}"]
     if "lower" in row:
         lines.append(f"value {number_text(row['lower'])} .. {number_text(row['upper'])}")
     else:
@@ -148,14 +149,16 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     columns += ["value as planned", "corner gap"] if partial else ["Q-values", "classes", "value"]
     cells = []
     for row in rows[:SHOWN_TASKS]:
-        cell = [short(row["name"]), len(row["actions"]), count_text(row["blocks"]), row["solver"]]
+        blocks = "–" if row["blocks"] is None else count_text(row["blocks"])
+        cell = [short(row["name"]), len(row["actions"]), blocks, row["solver"]]
         if partial:
             cell += [
                 f"{number_text(row['lower'])} .. {number_text(row['upper'])}",
                 number_text(row["corner_gap"], 2),
             ]
         else:
-            cell += [row.get("q_values", "–"), row.get("q_classes", "–"), number_text(row["value"])]
+            counts = ["–" if row.get(key) is None else row[key] for key in ("q_values", "q_classes")]
+            cell += [*counts, number_text(row["value"])]
         cells.append([*cell, seconds_text(row["seconds"]) if "seconds" in row else "–"])
     return table([*columns, "time"], cells, left=(0, 3))
 

@@ -196,13 +196,20 @@ def _checked(data: Any) -> RawProgram:
     def perhaps(number: Any) -> int | None:
         return None if number is None else node(number)
 
+    names = {_text(row[0]) for row in data["variables"]}
+
+    def variable(name: Any) -> str:
+        if _text(name) not in names:
+            raise ValueError("an update of no variable")
+        return str(name)
+
     def command(row: Any) -> RawCommand:
         label, guard, outcomes = row
         return RawCommand(
             _text(label),
             node(guard),
             tuple(
-                (node(chance), tuple((_text(name), node(value)) for name, value in updates))
+                (node(chance), tuple((variable(name), node(value)) for name, value in updates))
                 for chance, updates in outcomes
             ),
         )

@@ -199,6 +199,11 @@ def parse(text: str, parser: Any, lexer: Any) -> Any:
         return parser.parse(text)
     except KeyError as error:
         raise FaultError(f"the domain block has no {error.args[0]} section") from None
+    except ValueError:  # Python converts numbers of some thousand digits at most
+        long = re.search(r"[0-9]{4000}", text)
+        if long is None:
+            raise
+        raise FaultError("a number of more than 1000 digits", long.start()) from None
 
 
 class Table:
@@ -431,18 +436,14 @@ def main() -> None:
     memory, cpu, output, packages = sys.argv[1:5]
     limit(int(memory), int(cpu))
     stream = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)  # what libraries print is no part of the answer
-    os.dup2(nowhere, 2)
-    text = sys.stdin.buffer.read().decode("utf-8")
+    for printed in (1, 2):  # what libraries print is no part of the answer
+        os.dup2(os.open(os.devnull, os.O_WRONLY), printed)
     try:
-        data = json.dumps(answer(text, packages)).encode("ascii")
+        data = json.dumps(answer(sys.stdin.buffer.read().decode("utf-8"), packages)).encode("ascii")
     except MemoryError:
         data = b'{"limit": "memory"}'
-    if len(data) > int(output):
-        data = b'{"limit": "output"}'
-    stream.write(data)
-    stream.close()
+    with stream:
+        stream.write(data if len(data) <= int(output) else b'{"limit": "output"}')
 
 
 if __name__ == "__main__":

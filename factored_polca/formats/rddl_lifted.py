@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Final, NoReturn
 
+from factored_polca.formats.rddl_fault import GroundingFault
 from factored_polca.models.errors import ModelError
 from factored_polca.models.scalars import MAXIMUM_BITS, Scalar
 
@@ -226,17 +227,23 @@ def _refuse_depth(nodes: Iterable[Node]) -> None:
             raise ModelError(f"an expression is nested deeper than {MAXIMUM_DEPTH} levels")
 
 
-def _value(data: object) -> Scalar:
-    kind, text = _texts(data)
+def _value(data: object, where: str) -> Scalar:
+    pair = _texts(data)
+    if len(pair) != 2:
+        _broken()
+    kind, text = pair
     if kind == "boolean":
         return text == "true"
-    return number(text) if kind == "number" else text
+    try:
+        return number(text) if kind == "number" else text
+    except ValueError as error:
+        raise GroundingFault(f"{where}: {error}", -1) from None
 
 
 def _fluent(row: object) -> Fluent:
     if not isinstance(row, list) or len(row) != 6 or _text(row[1]) not in FLUENTS:
         _broken()
-    default = None if row[4] is None else _value(row[4])
+    default = None if row[4] is None else _value(row[4], f"the default of {_text(row[0])}")
     return Fluent(_text(row[0]), row[1], _text(row[2]), _texts(row[3]), default, _integer(row[5]))
 
 
@@ -261,7 +268,7 @@ def _assigned(rows: Iterable[object]) -> dict[tuple[str, Args], Scalar]:
     for row in rows:
         if not isinstance(row, list) or len(row) != 4 or row[2] is None:
             _broken()
-        result[_text(row[0]), _texts(row[1])] = _value(row[2])
+        result[_text(row[0]), _texts(row[1])] = _value(row[2], f"the value given to {_text(row[0])}")
     return result
 
 

@@ -179,6 +179,8 @@ class Forest:
             if len(parts) == 1:
                 return parts[0]
         self.count(len(parts))
+        if OPERATORS[name].associative:
+            parts = self._start_folded(name, parts)
         values = [part.value for part in parts if isinstance(part, Constant)]
         if len(values) == len(parts):
             result = apply_operator(name, values)
@@ -186,6 +188,15 @@ class Forest:
                 return self.constant(result)
         key = ("operation", name, *map(id, parts))
         return self._intern(key, lambda: Operation(name, parts), parts)
+
+    def _start_folded(self, name: str, parts: tuple[Expression, ...]) -> tuple[Expression, ...]:
+        """The constants at the start combined, as the native language reads them."""
+        while len(parts) > 2 and isinstance(parts[0], Constant) and isinstance(parts[1], Constant):
+            result = apply_operator(name, (parts[0].value, parts[1].value))
+            if isinstance(result, Undefined):
+                break
+            parts = (self.constant(result), *parts[2:])
+        return parts
 
     def conditional(self, condition: Expression, then: Expression, otherwise: Expression) -> Expression:
         """`then` where `condition` holds, `otherwise` elsewhere."""

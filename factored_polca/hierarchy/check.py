@@ -108,8 +108,8 @@ def solver_of(task: Task, default: str = "auto") -> str:
     method = (task.solver or default).replace("_", " ").replace("-", " ")
     short = {"vi": "value iteration", "pi": "policy iteration", "mpi": "modified policy iteration"}
     method = short.get(method, method)
-    if method != "auto" and method not in METHODS:
-        listed = ", ".join(["auto", *short, *METHODS])
+    if method not in ("auto", "structured") and method not in METHODS:
+        listed = ", ".join(["auto", *short, *METHODS, "structured"])
         raise ModelError(
             [Fault(f"no solver {method!r} for MDPs", ("tasks", task.name, "solver"), f"there are {listed}")]
         )

@@ -18,7 +18,8 @@ from factored_polca.diagrams.operations import leaf_payloads
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import planning_order
 from factored_polca.hierarchy.plan import HierarchicalPlan
-from factored_polca.hierarchy.solved import SolvedTask
+from factored_polca.hierarchy.solved import AnySolvedTask, StructuredTask
+from factored_polca.hierarchy.structured_task import policy_partition
 from factored_polca.minimisation import Partition
 from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import Model, TaskHierarchy
@@ -71,8 +72,13 @@ def executable(plan: HierarchicalPlan, report: Mapping[str, Any] | None = None) 
     )
 
 
-def task_policy(solved: SolvedTask) -> TaskPolicy:
-    """The choice in each block; where actions were exchanged blocks are split by what is chosen."""
+def task_policy(solved: AnySolvedTask) -> TaskPolicy:
+    """The choice in each block; where actions were exchanged blocks are split by what is chosen.
+
+    The blocks of a task that was solved on diagrams are the states of one choice and nearly one value.
+    """
+    if isinstance(solved, StructuredTask):
+        return TaskPolicy(solved.task.name, solved.task.actions, *policy_partition(solved.solution))
     reduction, solution = solved.reduction, solved.solution
     partition, choice = reduction.partition, solution.policy.astype(np.int32)
     values, terminal = solution.values, reduction.mdp.terminal

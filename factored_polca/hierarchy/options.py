@@ -12,6 +12,9 @@ from factored_polca.solvers.protocol import MdpSolver, PomdpSolver
 FLAT_BLOCK_LIMIT: Final = 100_000
 """Blocks up to which something flat is computed beside the hierarchical policy."""
 
+STRUCTURED_BLOCKS: Final = 250_000
+"""Blocks up to which a task whose state is seen is solved over blocks."""
+
 TRIALS: Final = 100
 """Trials of the search that solves a task whose state is not seen, at most."""
 
@@ -26,7 +29,8 @@ class Options:
     "package.module:Name", or a solver itself (`factored_polca.solvers.protocol`).
 
     For models whose state is seen (PolCA) `epsilon` is the gap that solvers close, relative to the
-    largest value.
+    largest value.  Where the quotient of a task with the solver "auto" has more than `structured_blocks`
+    blocks, or takes more memory than there is, the task is solved on diagrams: `solver` "structured".
 
     For those whose state is not (PolCA+) solvers stop where upper - lower <= `gap` at the initial belief,
     and for children at all corners, and after `trials` trials; `gap` None is a thousandth of the span of
@@ -50,3 +54,4 @@ class Options:
     maximum_observations: int = MAXIMUM_OBSERVATIONS
     assume_observed: bool = False
     interchangeable: bool = False
+    structured_blocks: int | None = STRUCTURED_BLOCKS

@@ -2,7 +2,8 @@
 
 For each subtask, children first: parameterise (`subtask`), cluster (`minimisation`), solve the
 quotient (`solvers`), and carry the policy back to the states as a diagram, which models the
-abstract action of the parents.  The result is recursively optimal: each subtask's policy is optimal
+abstract action of the parents.  A task whose quotient is too large is solved on diagrams instead
+(`structured_task`).  The result is recursively optimal: each subtask's policy is optimal
 given its children's.
 
 The polled policy takes at each state the primitive that the root's policy leads to, so its value
@@ -19,14 +20,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from factored_polca.diagrams import INDEX, Diagram, relabel
+from factored_polca.diagrams import INDEX, Diagram, MemoryLimit, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
-from factored_polca.hierarchy.solved import SolvedTask
+from factored_polca.hierarchy.solved import AnySolvedTask, SolvedTask, StructuredTask
+from factored_polca.hierarchy.structured_task import (
+    ASKED_FOR,
+    STRUCTURED,
+    can_fall_back,
+    lost_start,
+    on_diagrams,
+    solve_on_diagrams,
+)
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
+from factored_polca.hierarchy.task_warnings import task_warnings
 from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.minimisation.polynomial import interchangeable_fault
@@ -43,6 +53,7 @@ from factored_polca.models import (
 from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
 from factored_polca.solvers.pomdp_result import Demand
 from factored_polca.solvers.protocol import MdpSolver, call_mdp_solver
+from factored_polca.structured.solution import StructuredSolution
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 Progress = Callable[[str, str, int, int], None]
@@ -56,7 +67,7 @@ class Evaluation:
     value: float
     lower: float
     upper: float
-    blocks: int
+    blocks: int | None  # None: found on diagrams
     guarantee: Guarantee
 
 
@@ -71,7 +82,7 @@ class HierarchicalPlan(DrawnGraph, Framed):
 
     symbolic: SymbolicModel
     tasks: TaskHierarchy
-    solved: tuple[SolvedTask, ...]
+    solved: tuple[AnySolvedTask, ...]
     polled: Evaluation
     flat: Evaluation | None
     flat_note: str
@@ -83,7 +94,7 @@ class HierarchicalPlan(DrawnGraph, Framed):
         return f"<HierarchicalPlan of {self.model.name}: {tasks} tasks, worth {worth:.6g}>"
 
     @property
-    def root(self) -> SolvedTask:
+    def root(self) -> AnySolvedTask:
         """The task at the top."""
         return self.solved[-1]
 
@@ -92,7 +103,7 @@ class HierarchicalPlan(DrawnGraph, Framed):
         """The model that was planned for."""
         return self.symbolic.model
 
-    def task(self, name: str) -> SolvedTask:
+    def task(self, name: str) -> AnySolvedTask:
         """The solved task called `name`.
 
         Raises:
@@ -199,7 +210,7 @@ class _Planner:
     ) -> None:
         self.symbolic, self.hierarchy = symbolic, hierarchy
         self.options, self.progress = options, progress
-        self.solved: dict[str, SolvedTask] = {}
+        self.solved: dict[str, AnySolvedTask] = {}
         self.custom = None if options.assume_observed else custom_solver(options.solver)
         self.reachable: Diagram | None = None
         if options.reachable:
@@ -257,9 +268,13 @@ class _Planner:
             "auto" if self.options.assume_observed else solver_of(task, named_solver(self.options.solver))
         )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
-        reduction = self.reduce(task.name, process, self.options.block_limit)
+        custom = self.custom if task.solver is None else None
+        reduction = self.reduced(task.name, process, method, custom)
+        if isinstance(reduction, str):
+            self.solved[task.name] = self.on_diagrams(task, process, reduction)
+            return
         refuse_without_purpose(task, reduction.mdp)
-        solution = self.optimise(task.name, reduction, method, self.custom if task.solver is None else None)
+        solution = self.optimise(task.name, reduction, method, custom)
         if isinstance(reduction, InterchangeableReduction):
             counts = count_exchanged(reduction.exchanged)
         else:
@@ -276,18 +291,56 @@ class _Planner:
         )  # fmt: skip
         self.tell(task.name, "done", 0, reduction.partition.blocks)
 
-    def polled(self, root: SolvedTask) -> Evaluation:
+    def reduced(
+        self, name: str, process: DecisionProcess, method: str, custom: MdpSolver | None = None
+    ) -> Reduction | str:
+        """The reduction of a process, or why it is to be solved on diagrams."""
+        if method == STRUCTURED:
+            return ASKED_FOR
+        options = self.options
+        falls_back = method == "auto" and custom is None and self.symbolic.model.discount != 1
+        limit = options.block_limit
+        if falls_back and options.structured_blocks is not None:
+            limit = min(options.structured_blocks, limit or options.structured_blocks)
+        try:
+            return self.reduce(name, process, limit)
+        except LimitReached as error:
+            if not falls_back or not can_fall_back(error, limit == options.block_limit):
+                raise
+            return f"no quotient ({error})"
+        except MemoryLimit as error:
+            if not falls_back:
+                raise
+            return f"no quotient ({error})"
+
+    def on_diagrams(self, task: Task, process: DecisionProcess, reason: str) -> StructuredTask:
+        """Steps 3 and 4 of PolCA without a quotient."""
+
+        def progress(sweeps: int, gap: float, nodes: int) -> None:
+            self.tell(task.name, f"sweep {sweeps}, {nodes:,} nodes, gap {gap:.3g}")
+
+        solved = solve_on_diagrams(task, process, self.options, reason, progress)
+        self.tell(task.name, "done")
+        return solved
+
+    def polled(self, root: AnySolvedTask) -> Evaluation:
         """The value of the polled policy under the model's reward."""
-        process = root.reduction.process
+        process = root.process
         taken = policy_primitives(root.policy, root.defined, len(self.symbolic.actions))
         choice = Choice("polled policy", root.defined, taken, root.policy)
         rewards = {p: self.symbolic.actions[p].rewards for p in taken}
         chain = DecisionProcess(self.symbolic, (choice,), process.terminal, rewards, process.reachable)
-        reduction = self.reduce("polled policy", chain, self.options.block_limit)
-        solution = self.optimise("polled policy", reduction, "auto")
-        return evaluate(reduction, solution)
+        method = STRUCTURED if isinstance(root, StructuredTask) else "auto"
+        return self.evaluated("polled policy", chain, self.reduced("polled policy", chain, method))
 
-    def flat(self, root: SolvedTask) -> tuple[Evaluation | None, str]:
+    def evaluated(self, name: str, process: DecisionProcess, reduction: Reduction | str) -> Evaluation:
+        """The optimum of a process, over blocks or on diagrams."""
+        if isinstance(reduction, Reduction):
+            return evaluate(reduction, self.optimise(name, reduction, "auto"))
+        self.tell(name, "structured value iteration")
+        return evaluate_structured(on_diagrams(name, process, self.options))
+
+    def flat(self, root: AnySolvedTask) -> tuple[Evaluation | None, str]:
         """The optimum over all primitive actions, or why it was left out."""
         limit = self.options.flat_block_limit
         if limit is None:
@@ -296,6 +349,8 @@ class _Planner:
         task = root.task
         flat_already = len(self.solved) == 1 and task.actions == names and not task.has_pseudo_reward
         if flat_already:
+            if isinstance(root, StructuredTask):
+                return evaluate_structured(root.solution), "the plan is flat"
             return evaluate(root.reduction, root.solution), "the plan is flat"
         reachable = None
         if self.options.reachable:
@@ -303,15 +358,15 @@ class _Planner:
 
             reachable = reachable_states(self.symbolic).diagram
         try:
-            process = flat_process(
-                self.symbolic, reachable=reachable, terminal=root.reduction.process.terminal
-            )
+            process = flat_process(self.symbolic, reachable=reachable, terminal=root.process.terminal)
             process = replace(process, channels=None)
-            reduction = self.reduce("flat optimum", process, limit)
-            solution = self.optimise("flat optimum", reduction, "auto")
+            reduction: Reduction | str = ASKED_FOR
+            if named_solver(self.options.solver) != STRUCTURED:
+                reduction = self.reduce("flat optimum", process, limit)
+            found = self.evaluated("flat optimum", process, reduction)
         except LimitReached as error:
             return None, f"left out: {error}"
-        return evaluate(reduction, solution), "solved over all primitive actions"
+        return found, "solved over all primitive actions"
 
 
 def expectation(belief: np.typing.NDArray[np.float64], values: np.typing.NDArray[np.float64]) -> float:
@@ -332,22 +387,30 @@ def evaluate(reduction: Reduction, solution: MDPSolution) -> Evaluation:
     )
 
 
+def evaluate_structured(solution: StructuredSolution) -> Evaluation:
+    """The value at the initial belief of what was solved on diagrams."""
+    return Evaluation(solution.value, solution.lower, solution.upper, None, solution.guarantee)
+
+
 def describe_block(reduction: Reduction, block: int) -> str:
     """A block by its first state."""
     partition = reduction.partition
     return partition.symbolic.state_text(partition.representatives[block].tolist())
 
 
-def refuse_unavoidable_dead_ends(root: SolvedTask) -> None:
+def refuse_unavoidable_dead_ends(root: AnySolvedTask) -> None:
     """Raise an error if the polled policy can run into a dead end from a start state.
 
     Raises:
         ModelError: naming such a start.
     """
-    belief = root.reduction.project_initial()
-    lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
-    if len(lost):
-        state = describe_block(root.reduction, int(lost[0]))
+    if isinstance(root, StructuredTask):
+        state = lost_start(root.solution)
+    else:
+        belief = root.reduction.project_initial()
+        lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
+        state = describe_block(root.reduction, int(lost[0])) if len(lost) else None
+    if state is not None:
         raise ModelError(
             [
                 Fault(
@@ -360,45 +423,13 @@ def refuse_unavoidable_dead_ends(root: SolvedTask) -> None:
         )
 
 
-def task_warnings(
-    task: Task, reduction: Reduction, solution: MDPSolution, dead: int, *, is_child: bool
-) -> tuple[str, ...]:
-    """What a person should know of a solved task."""
-    found = []
-    if dead:
-        found.append(
-            f"task {task.name!r}: {dead:,} states can't avoid a state that is not terminal and has no "
-            "applicable action; its policy is undefined there"
-        )
-    if not solution.converged:
-        found.append(
-            f"task {task.name!r}: the solver stopped early ({solution.status}), gap {solution.gap:.3g}"
-        )
-    if is_child and not task.has_pseudo_reward and equal_across_choices(reduction):
-        found.append(
-            f"task {task.name!r}: in each state its actions have equal rewards; a pseudo_reward would tell "
-            "it what to aim for"
-        )
-    return tuple(found)
-
-
-def equal_across_choices(reduction: Reduction) -> bool:
-    """Whether several choices, wherever they are applicable in one block, have one reward."""
-    mdp = reduction.mdp
-    several = mdp.applicable.sum(axis=0) > 1
-    if not several.any():
-        return False
-    high = np.where(mdp.applicable, mdp.rewards, -np.inf)[:, several].max(axis=0)
-    low = np.where(mdp.applicable, mdp.rewards, np.inf)[:, several].min(axis=0)
-    return bool((high <= low).all())
-
-
-def total_counts(solved: Mapping[str, SolvedTask] | Sequence[SolvedTask]) -> QValueCounts:
-    """The counts of all subtasks together."""
+def total_counts(solved: Mapping[str, AnySolvedTask] | Sequence[AnySolvedTask]) -> QValueCounts:
+    """The counts of all subtasks together that were solved over blocks."""
     tasks = list(solved.values()) if isinstance(solved, Mapping) else list(solved)
+    counts = [task.counts for task in tasks if task.counts is not None]
     return QValueCounts(
-        sum(task.counts.q_values for task in tasks),
-        sum(task.counts.q_applicable for task in tasks),
-        sum(task.counts.q_classes for task in tasks),
-        sum(task.counts.q_classes_shared for task in tasks),
+        sum(count.q_values for count in counts),
+        sum(count.q_applicable for count in counts),
+        sum(count.q_classes for count in counts),
+        sum(count.q_classes_shared for count in counts),
     )

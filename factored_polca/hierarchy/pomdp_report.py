@@ -8,6 +8,7 @@ from factored_polca.hierarchy.parameters import mdp_parameters, pomdp_parameters
 from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
 from factored_polca.hierarchy.pomdp_solved import SolvedPomdpTask
+from factored_polca.hierarchy.solved import StructuredTask
 
 
 def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) -> dict[str, Any]:
@@ -45,9 +46,12 @@ def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) ->
     }
 
 
-def polca_parameters(polca: HierarchicalPlan, name: str) -> int:
-    """The parameters of one task as PolCA sees it."""
-    return mdp_parameters(polca.task(name).reduction.quotient.mdp)
+def polca_parameters(polca: HierarchicalPlan, name: str) -> int | None:
+    """The parameters of one task as PolCA sees it; None where it was solved without a quotient."""
+    solved = polca.task(name)
+    if isinstance(solved, StructuredTask):
+        return None
+    return mdp_parameters(solved.reduction.quotient.mdp)
 
 
 def total(tasks: list[dict[str, Any]], key: str) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
+from factored_polca.hierarchy.solved import AnySolvedTask, StructuredTask
 
 
 def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
@@ -23,18 +24,20 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
             {
                 "name": solved.task.name,
                 "actions": list(solved.task.actions),
-                "blocks": solved.reduction.partition.blocks,
-                "q_values": solved.counts.q_values,
-                "q_applicable": solved.counts.q_applicable,
-                "q_classes": solved.counts.q_classes,
-                "q_classes_shared": solved.counts.q_classes_shared,
+                "blocks": solved.blocks,
+                "q_values": None if solved.counts is None else solved.counts.q_values,
+                "q_applicable": None if solved.counts is None else solved.counts.q_applicable,
+                "q_classes": None if solved.counts is None else solved.counts.q_classes,
+                "q_classes_shared": None if solved.counts is None else solved.counts.q_classes_shared,
                 "value": solved.value,
-                "solver": solved.solution.method,
-                "gap": solved.solution.gap,
-                "ties": solved.solution.ties,
+                "solver": solved.method,
+                "gap": solved.gap,
+                "ties": solved.ties,
                 "dead_end_states": solved.dead_end_states,
-                "collision_bound": solved.reduction.minimisation.collision_bound,
+                "collision_bound": collision_bound(solved),
                 "seconds": solved.seconds,
+                "nodes": solved.solution.nodes if isinstance(solved, StructuredTask) else None,
+                "note": solved.solution.note if isinstance(solved, StructuredTask) else "",
             }
             for solved in plan.solved
         ],
@@ -53,10 +56,23 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
 def guarantee(plan: HierarchicalPlan) -> str:
     """How far the value may be trusted, in words."""
     width = plan.polled.upper - plan.polled.lower
-    gap = max(solved.solution.gap for solved in plan.solved)
-    chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
+    gap = max(solved.gap for solved in plan.solved)
+    bounds = [collision_bound(solved) for solved in plan.solved]
+    chance = sum(bound for bound in bounds if bound is not None)
+    names = [solved.task.name for solved in plan.solved if isinstance(solved, StructuredTask)]
+    partitions = f"each partition exact but for a chance below {max(chance, 1e-300):.1g}"
+    if len(names) == len(plan.solved):
+        partitions = "no partition was needed: structured value iteration on diagrams"
+    elif names:
+        partitions += f"; without one, by structured value iteration on diagrams: {', '.join(names)}"
     return (
         f"recursively optimal (each task given its children's policies, solver gaps up to {gap:.1g}); the "
-        f"policy's value lies in bounds {width:.1g} wide; each partition exact but for a chance "
-        f"below {max(chance, 1e-300):.1g}"
+        f"policy's value lies in bounds {width:.1g} wide; {partitions}"
     )
+
+
+def collision_bound(solved: AnySolvedTask) -> float | None:
+    """The chance that the partition of a task is too coarse; None where there is no partition."""
+    if isinstance(solved, StructuredTask):
+        return None
+    return solved.reduction.minimisation.collision_bound

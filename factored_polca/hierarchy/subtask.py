@@ -132,9 +132,14 @@ def refuse_without_purpose(task: Task, mdp: ArrayMDP) -> None:
     ends = any((matrix @ mdp.terminal.astype(float)).any() for matrix in mdp.transitions)
     if rewards[0] != 0 and ends:
         return
-    what = "0" if rewards[0] == 0 else "one constant"
+    raise nothing_to_optimise(task, zero=rewards[0] == 0, ends=ends)
+
+
+def nothing_to_optimise(task: Task, *, zero: bool, ends: bool) -> ModelError:
+    """The error about a task whose local reward is one constant."""
+    what = "0" if zero else "one constant"
     end = "" if ends else " and the task can never end"
-    raise ModelError(
+    return ModelError(
         [
             Fault(
                 f"task {task.name!r} has nothing to optimise: its reward is {what} for every action in "

@@ -19,7 +19,7 @@ taken, or behind a deciding `and`/`or`, is harmless.  All numbers are rationals.
 from __future__ import annotations
 
 import numbers
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -304,16 +304,22 @@ def as_expression(thing: ExpressionLike) -> Expression:
 
 def operation(name: str, *arguments: ExpressionLike) -> Expression:
     """Operator `name` on `arguments`: nested associative operators are flattened, constants folded."""
-    row = OPERATORS[name]
     parts = [as_expression(argument) for argument in arguments]
-    if row.associative:
+    if OPERATORS[name].associative:
         flat: list[Expression] = []
         for part in parts:
             if isinstance(part, Operation) and part.operator == name:
                 flat.extend(part.arguments)
             else:
                 flat.append(part)
-        parts = _fold_start(name, flat)
+        parts = flat
+    return grouped(name, parts)
+
+
+def grouped(name: str, parts: Sequence[Expression]) -> Expression:
+    """Operator `name` on `parts` as they are bracketed; constants are folded."""
+    if OPERATORS[name].associative:
+        parts = _fold_start(name, parts)
         if len(parts) == 1:
             return parts[0]
     constants = [part.value for part in parts if isinstance(part, Constant)]
@@ -324,7 +330,7 @@ def operation(name: str, *arguments: ExpressionLike) -> Expression:
     return Operation(name, tuple(parts))
 
 
-def _fold_start(name: str, parts: list[Expression]) -> list[Expression]:
+def _fold_start(name: str, parts: Sequence[Expression]) -> list[Expression]:
     """`parts` with the constants at its start combined, as reading from left to right does."""
     first, rest = parts[0], 1
     while rest < len(parts):

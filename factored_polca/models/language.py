@@ -42,6 +42,7 @@ from factored_polca.models.expressions import (
     conjunction,
     depth,
     disjunction,
+    grouped,
     operation,
 )
 from factored_polca.models.scalars import MAXIMUM_BITS, OPERATORS, Value
@@ -209,13 +210,13 @@ class _Parser:
         parts = [self.conjunct()]
         while self.accept("or"):
             parts.append(self.conjunct())
-        return disjunction(parts) if len(parts) > 1 else parts[0]
+        return grouped("or", parts) if len(parts) > 1 else parts[0]
 
     def conjunct(self) -> Expression:
         parts = [self.inverse()]
         while self.accept("and"):
             parts.append(self.inverse())
-        return conjunction(parts) if len(parts) > 1 else parts[0]
+        return grouped("and", parts) if len(parts) > 1 else parts[0]
 
     def inverse(self) -> Expression:
         if self.accept("not"):
@@ -255,9 +256,8 @@ class _Parser:
             self.position += 1
             right = self.term()
             parts.append(operation("negate", right) if minus else right)
-            if len(parts) == 2 and all(isinstance(part, Constant) for part in parts):
-                parts = [self.folded(operation("add", *parts))]
-        return operation("add", *parts) if len(parts) > 1 else parts[0]
+            parts = self.started("add", parts)
+        return grouped("add", parts) if len(parts) > 1 else parts[0]
 
     def term(self) -> Expression:
         run = [self.factor()]
@@ -266,12 +266,19 @@ class _Parser:
             self.position += 1
             if name == "multiply":
                 run.append(self.factor())
-                if len(run) == 2 and all(isinstance(part, Constant) for part in run):
-                    run = [self.folded(operation("multiply", *run))]
+                run = self.started("multiply", run)
                 continue
-            left = operation("multiply", *run) if len(run) > 1 else run[0]
+            left = grouped("multiply", run) if len(run) > 1 else run[0]
             run = [self.folded(operation(name, left, self.factor()))]
-        return operation("multiply", *run) if len(run) > 1 else run[0]
+        return grouped("multiply", run) if len(run) > 1 else run[0]
+
+    def started(self, name: str, parts: list[Expression]) -> list[Expression]:
+        """Two constants that begin a sum or a product as one, where they have a value together."""
+        if len(parts) == 2 and all(isinstance(part, Constant) for part in parts):
+            start = self.folded(grouped(name, parts))
+            if isinstance(start, Constant):
+                return [start]
+        return parts
 
     def factor(self) -> Expression:
         if self.accept("-"):

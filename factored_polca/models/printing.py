@@ -119,8 +119,9 @@ def _operation_text(e: Operation, wrap: object) -> tuple[str, int]:
         return f"{symbol}{' ' if name == 'not' else ''}{show(e.arguments[0], level)}", level
     if name == "power":
         return f"{show(e.arguments[0], _ATOM)} ** {show(e.arguments[1], 8)}", level
+    nested = isinstance(e.arguments[0], Operation) and e.arguments[0].operator == name
     if name == "add":
-        text = show(e.arguments[0], level)
+        text = show(e.arguments[0], level + nested)
         for part in e.arguments[1:]:
             shown = show(part, level + 1)
             minus = isinstance(part, Operation) and part.operator == "negate"
@@ -132,5 +133,7 @@ def _operation_text(e: Operation, wrap: object) -> tuple[str, int]:
     if level == 5:
         return f"{show(e.arguments[0], 6)} {symbol} {show(e.arguments[1], 6)}", level
     first = level if name in ("multiply", "divide", "floor_divide", "modulo") else level + 1
+    if name == "multiply":
+        first += nested
     parts = [show(e.arguments[0], first)] + [show(a, level + 1) for a in e.arguments[1:]]
     return f" {symbol} ".join(parts), level

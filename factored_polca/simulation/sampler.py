@@ -15,6 +15,7 @@ import numpy.typing as npt
 from factored_polca.diagrams import evaluate_states
 from factored_polca.models.features import position
 from factored_polca.symbolic import RowDiagram, SymbolicModel, Term
+from factored_polca.symbolic.floats import as_float
 
 States = npt.NDArray[np.int32]  # [episode, feature] value numbers
 FloatArray = npt.NDArray[np.float64]
@@ -84,7 +85,7 @@ class Sampler:
         """The sum of reward terms over present states alone, expectations taken [episode]."""
         total = np.zeros(len(states))
         for term in terms:
-            values = np.array([float(value) for value in term.values])
+            values = np.array([as_float(value) for value in term.values])
             total += values[evaluate_states(term.diagram, states, self._columns).astype(np.int64)]
         return total
 
@@ -123,7 +124,7 @@ class Sampler:
         pairs = np.concatenate([states, following], axis=1)
         total = np.zeros(len(states))
         for term in terms:
-            values = np.array([float(value) for value in term.values])
+            values = np.array([as_float(value) for value in term.values])
             total += values[evaluate_states(term.diagram, pairs, self._columns).astype(np.int64)]
         return total
 

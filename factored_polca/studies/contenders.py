@@ -138,7 +138,7 @@ def make_contest(
     flat = flat_model(symbolic, options)
     qmdp = flat.solve("qmdp")
     partitions = [*polled.partitions, flat.reduction.partition]
-    known = [polca.root.policy, *(solved.reduction.partition.diagram for solved in polca.solved)]
+    known = [polca.root.policy, *(solved.cells for solved in polca.solved)]
     tracker = make_block_tracker(
         symbolic,
         partitions,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib import import_module
@@ -53,6 +53,12 @@ class Subject:
 
     model: Model
     tasks: TaskHierarchy | None
+
+
+def total_blocks(blocks: Sequence[int | None]) -> int | None:
+    """The blocks of all tasks; None where one was solved without blocks."""
+    known = [count for count in blocks if count is not None]
+    return sum(known) if len(known) == len(blocks) else None
 
 
 def perform(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
@@ -147,6 +153,7 @@ def plan(subject: Subject, request: Mapping[str, Any], tell: Tell) -> dict[str, 
     from factored_polca.hierarchy import Options, PomdpPlan
     from factored_polca.hierarchy import plan as plan_model
     from factored_polca.hierarchy.options import FLAT_BLOCK_LIMIT, TRIALS
+    from factored_polca.hierarchy.solved import StructuredTask
 
     given = request["options"]
     options = Options(
@@ -166,9 +173,13 @@ def plan(subject: Subject, request: Mapping[str, Any], tell: Tell) -> dict[str, 
     began = time.perf_counter()
     tell("compiling diagrams")
     found = plan_model(subject.model, subject.tasks, options, progress=progress)
+    blocks = [
+        None if isinstance(solved, StructuredTask) else solved.reduction.partition.blocks
+        for solved in found.solved
+    ]
     figures: dict[str, Any] = {
-        "blocks": sum(solved.reduction.partition.blocks for solved in found.solved),
-        "root_blocks": found.root.reduction.partition.blocks,
+        "blocks": total_blocks(blocks),
+        "root_blocks": blocks[-1],
         "tasks": len(found.solved),
     }
     if isinstance(found, PomdpPlan):

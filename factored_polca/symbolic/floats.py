@@ -11,13 +11,14 @@ LARGEST_REWARD_EXPONENT: Final = 200
 LARGEST_REWARD: Final = 10**LARGEST_REWARD_EXPONENT
 
 
-def as_float(reward: Fraction, action: str) -> float:
-    """A reward of an action as a float.
+def as_float(reward: Fraction, action: str | None = None) -> float:
+    """A reward, of an action if one is named, as a float.
 
     Raises:
         ModelError: so large that sums of it would leave the range of floats.
     """
     if abs(reward) > LARGEST_REWARD:
-        message = f"action {action!r} has a reward beyond 10^{LARGEST_REWARD_EXPONENT}"
+        whose = "there is" if action is None else f"action {action!r} has"
+        message = f"{whose} a reward beyond 10^{LARGEST_REWARD_EXPONENT}"
         raise ModelError([Fault(message, ("reward",), "values are floats: scale the rewards down")])
     return float(reward)

@@ -101,20 +101,25 @@ class NumericView:
     def weights(self, action: int, feature: int) -> list[Diagram]:
         """P_a(x_i' = v | parents) for each v."""
         row = self.symbolic.actions[action].rows.get(feature)
-        key = (-1, feature) if row is None else (id(row.diagram), id(row.rows))  # actions share them
+        if row is None:
+            return self.persisting(feature)
+        key = (id(row.diagram), id(row.rows))  # actions share them
         if key not in self._weights:
-            if row is None:
-                level = self.symbolic.now(feature)
-                size = len(self.symbolic.model.features[feature].values)
-                parts = [
-                    choose(self.manager.indicator(level, [v]), self.one, self.zero) for v in range(size)
-                ]
-            else:
-                parts = [
-                    relabel(row.diagram, self.stored([r[v] for r in row.rows]), self.leaf_type)
-                    for v in range(len(row.rows[0]))
-                ]
-            self._weights[key] = parts
+            self._weights[key] = [
+                relabel(row.diagram, self.stored([r[v] for r in row.rows]), self.leaf_type)
+                for v in range(len(row.rows[0]))
+            ]
+        return self._weights[key]
+
+    def persisting(self, feature: int) -> list[Diagram]:
+        """P(x_i' = v | x_i) for each v where the feature stays what it is."""
+        key = (-1, feature)
+        if key not in self._weights:
+            level = self.symbolic.now(feature)
+            size = len(self.symbolic.model.features[feature].values)
+            self._weights[key] = [
+                choose(self.manager.indicator(level, [v]), self.one, self.zero) for v in range(size)
+            ]
         return self._weights[key]
 
     def regress(self, action: int, value: Diagram) -> Diagram:

@@ -21,7 +21,7 @@ from factored_polca.hierarchy.policy_file import load_policy
 from factored_polca.hierarchy.pomdp_plan_file import load_pomdp_plan
 from factored_polca.models import LimitReached, ModelError
 
-from . import archives, cassandra_text, native_text, policy_texts, pomdpx_text, spudd_text
+from . import answers, archives, cassandra_text, native_text, policy_texts, pomdpx_text, spudd_text
 from .choices import Choices
 from .mutation import mutated
 
@@ -179,6 +179,13 @@ def _archive(kind: str, load: Callable[[str], Any]) -> Reader:
     )
 
 
+def _parsed_elsewhere(name: str) -> Reader:
+    return Reader(
+        f"input.{name}", False, lambda: answers.answered(name), answers.changer(name), answers.new(name),
+        answers.reading(name),
+    )  # fmt: skip
+
+
 READERS: Final[dict[str, Reader]] = {
     "native": _model(".toml", native_text.WORDS, native_text.native_text),
     "spudd": _model(".dat", spudd_text.WORDS, spudd_text.spudd_text),
@@ -194,6 +201,7 @@ READERS: Final[dict[str, Reader]] = {
     "plan": _archive("plan", load_plan),
     "belief-plan": _archive("belief-plan", load_pomdp_plan),
     "policy": _archive("policy", load_policy),
+    **{name: _parsed_elsewhere(name) for name in answers.parsers()},
 }  # fmt: skip
 """Name -> reader."""
 
