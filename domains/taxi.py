@@ -59,7 +59,9 @@ from factored_polca.models import (
 
 Size = Annotated[int, "cells along each side of the grid, from 2 on"]
 Slip = Annotated[
-    bool | str, 'moves slip: true for "0.8,0.1,0.1" (ahead, left, right), false, or three such numbers'
+    bool | str,
+    'moves slip: true for "0.8,0.1,0.1" (ahead, left, right), false, three such numbers, or the chance of '
+    "going aside, half of it to each side",
 ]
 Anywhere = Annotated[bool, "the passenger may wait in any cell (Taxi2); at most size 30"]
 NoiseBits = Annotated[int, "number of random truth values that matter to nothing"]
@@ -181,8 +183,13 @@ def _chances(slip: bool | str) -> Chances | None:
     if slip is False:
         return None
     parts = ["0.8", "0.1", "0.1"] if slip is True else str(slip).split(",")
+    if isinstance(slip, Fraction) or len(parts) == 1:
+        aside = probability("slip", slip)
+        return 1 - aside, aside / 2, aside / 2
     if len(parts) != 3:
-        raise ModelError(f'slip is {slip!r}: it must be true, false or three numbers as "0.8,0.1,0.1"')
+        raise ModelError(
+            f'slip is {slip!r}: it must be true, false, a number or three numbers as "0.8,0.1,0.1"'
+        )
     ahead, left, right = (probability("slip", part) for part in parts)
     if ahead + left + right != 1 or ahead == 0 or left + right == 0:
         raise ModelError(f"slip is {slip!r}: ahead and a side must be above 0, and the three sum to 1")

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         plan_pomdp,
     )
     from factored_polca.hierarchy.executable import ExecutablePlan, executable
+    from factored_polca.hierarchy.irrelevance import ValueClasses, executable_by_classes, value_classes
     from factored_polca.hierarchy.plan_file import load_plan, save_plan
     from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
     from factored_polca.hierarchy.pomdp_plan_file import load_pomdp_plan, save_pomdp_plan
@@ -69,6 +70,15 @@ if TYPE_CHECKING:
         lottery,
         uniform,
     )
+    from factored_polca.parametric import (
+        ParametricProcess,
+        ParametricQuotient,
+        compile_parametric,
+        parametric_flat_process,
+        parametric_process,
+        reduce_parametric,
+    )
+    from factored_polca.parametric.sensitivity import Sensitivity, sensitivity
     from factored_polca.simulation import Simulation, simulate
     from factored_polca.simulation.belief_runs import BeliefRuns
     from factored_polca.simulation.comparison import Comparison, compare
@@ -94,6 +104,7 @@ _HOME: Final = {
         "plan_pomdp",
     ),
     "hierarchy.executable": ("ExecutablePlan", "executable"),
+    "hierarchy.irrelevance": ("ValueClasses", "executable_by_classes", "value_classes"),
     "hierarchy.plan_file": ("load_plan", "save_plan"),
     "hierarchy.pomdp_executable": ("ExecutablePomdpPlan", "executable_pomdp"),
     "hierarchy.pomdp_plan_file": ("load_pomdp_plan", "save_pomdp_plan"),
@@ -107,6 +118,11 @@ _HOME: Final = {
         "Action", "Fault", "Feature", "InitialBelief", "LimitReached", "Model", "ModelError", "Observation",
         "Task", "TaskHierarchy", "boolean", "check", "check_tasks", "conditional", "lottery", "uniform",
     ),
+    "parametric": (
+        "ParametricProcess", "ParametricQuotient", "compile_parametric", "parametric_flat_process",
+        "parametric_process", "reduce_parametric",
+    ),
+    "parametric.sensitivity": ("Sensitivity", "sensitivity"),
     "simulation": ("Simulation", "simulate"),
     "simulation.belief_runs": ("BeliefRuns",),
     "simulation.comparison": ("Comparison", "compare"),
@@ -131,15 +147,18 @@ __all__ = [
     "Certificate", "Comparison", "Controller", "Decision", "Demand", "Diagram", "Document",
     "ExecutablePlan", "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief",
     "LimitReached", "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation",
-    "Model", "ModelError", "Observation", "Options", "POMDPSolution", "Partition", "Poll", "PomdpPlan",
-    "PomdpSolver", "Reduction", "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task",
-    "TaskHierarchy", "Trace", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify",
-    "check", "check_tasks", "choose_tracker", "compare", "compile_model", "conditional", "domains",
-    "executable", "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan",
-    "load_pomdp_plan", "lottery", "measure", "minimise", "plan", "plan_mdp", "plan_pomdp",
-    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "save_plan", "save_pomdp_plan",
-    "simulate", "solution_of_actions", "solution_of_policy", "solve_mdp", "solve_pomdp", "trace",
-    "uniform", "unreduced_pomdp", "write",
+    "Model", "ModelError", "Observation", "Options", "POMDPSolution", "ParametricProcess",
+    "ParametricQuotient", "Partition", "Poll", "PomdpPlan", "PomdpSolver", "Reduction", "Sensitivity",
+    "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "Trace",
+    "ValueClasses", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify", "check",
+    "check_tasks", "choose_tracker", "compare", "compile_model", "compile_parametric", "conditional",
+    "domains", "executable", "executable_by_classes", "executable_pomdp", "flat_process",
+    "independent_belief", "load_domain", "load_plan", "load_pomdp_plan", "lottery", "measure",
+    "minimise", "parametric_flat_process", "parametric_process", "plan", "plan_mdp", "plan_pomdp",
+    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "reduce_parametric",
+    "save_plan", "save_pomdp_plan", "sensitivity", "simulate", "solution_of_actions",
+    "solution_of_policy", "solve_mdp", "solve_pomdp", "trace", "uniform", "unreduced_pomdp",
+    "value_classes", "write",
 ]  # fmt: skip
 
 

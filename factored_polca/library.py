@@ -16,7 +16,7 @@ import importlib.util
 import inspect
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +25,8 @@ from typing import Annotated, Any, Final, TypeAlias, Union, get_args, get_origin
 
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy
 from factored_polca.models.model import rational
+from factored_polca.models.rational_functions import FunctionField, RationalFunction, SymbolUsed
+from factored_polca.models.written_out import with_parameters_written_out
 
 Number: TypeAlias = Fraction | str | float
 """A number as a domain takes it; a text or a float means its decimal exactly ("0.1" is 1/10)."""
@@ -91,8 +93,11 @@ def domains() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in folder().glob("*.py") if _NAME.fullmatch(path.stem)))
 
 
-def load(name: str, parameters: Mapping[str, object] | None = None) -> Domain:
+def load(name: str, parameters: Mapping[str, object] | None = None, *, keep: Iterable[str] = ()) -> Domain:
     """The domain `name` with `parameters`; a text such as "10" is read as the parameter's type says.
+
+    Parameters that `keep` names become parameters of the model, with their value as a number that can
+    still be changed; the others are worked in.
 
     Raises:
         ModelError: no such domain or parameter, or a value that the domain refuses; the message
@@ -101,9 +106,43 @@ def load(name: str, parameters: Mapping[str, object] | None = None) -> Domain:
     module = _module(name)
     values = {key: _convert(name, key, value) for key, value in _known(name, parameters or {}).items()}
     try:
-        return Domain(name, module.model(**values), module.tasks(**values))
+        tasks = module.tasks(**values)
+        kept = _kept(name, values, keep)
+        if not kept:
+            return Domain(name, module.model(**values), tasks)
+        field = FunctionField(tuple(kept))
+        model = module.model(**{**values, **{key: field.symbol(key) for key in kept}})
+        return Domain(name, with_parameters_written_out(model, kept), tasks)
+    except SymbolUsed as error:
+        listed = ", ".join(kept)
+        message = f"{listed} can't stay a symbol: the domain needs its value to make the model"
+        raise ModelError([Fault(message, file=name)]) from error
     except ModelError as error:
         raise error.in_file(name) from None
+
+
+def numeric_parameters(name: str) -> tuple[str, ...]:
+    """The parameters of a domain that are numbers of its model: those of the kind number, the discount not.
+
+    Raises:
+        ModelError: no such domain.
+    """
+    found = _parameters(_module(name).model)
+    return tuple(
+        key for key, (_, hint, _) in found.items() if key != "discount" and _kind(hint) == "number"
+    )
+
+
+def _kept(name: str, values: Mapping[str, object], keep: Iterable[str]) -> dict[str, Fraction]:
+    """The values of the parameters that stay symbols."""
+    known = _parameters(_module(name).model)
+    _known(name, dict.fromkeys(keep))
+    kept = {}
+    for key in dict.fromkeys(keep):
+        if key == "discount":
+            raise ModelError([Fault("the discount can't stay a symbol", (key,), "it is no probability")])
+        kept[key] = number(key, values.get(key, known[key][0].default))
+    return kept
 
 
 def describe(name: str) -> DomainDescription:
@@ -244,6 +283,8 @@ def probability(name: str, value: object) -> Fraction:
         ModelError: it is none.
     """
     chance = number(name, value)
+    if isinstance(chance, RationalFunction):
+        return chance  # whose values are asked for later
     if not 0 <= chance <= 1:
         raise _refused(name, value, "a probability from 0 to 1")
     return chance

@@ -305,7 +305,8 @@ def test_info_counts_states_however_many(run_json: Run, run_text: Run, folder: P
 
 def test_check_finds_no_fault_in_shipped_domains(run_json: Run, run_text: Run) -> None:
     for name in ("toy", "taxi", "linear"):
-        assert run_json("check", name) == {"model": name, "ok": True, "faults": []}
+        data = run_json("check", name)
+        assert (data["model"], data["ok"], data["faults"]) == (name, True, [])
     assert "no fault" in run_text("check", "toy")
 
 
@@ -346,9 +347,8 @@ def test_convert_writes_every_format_and_info_reads_it(
 
 
 def test_convert_lists_states_or_blocks(run_json: Run, folder: Path) -> None:
-    assert run_json("convert", "linear", "blocks.pomdp", "--set", "size=40", "--minimise") == {
-        "file": "blocks.pomdp", "states": 2**40, "blocks": 41,
-    }  # fmt: skip
+    data = run_json("convert", "linear", "blocks.pomdp", "--set", "size=40", "--minimise")
+    assert (data["file"], data["states"], data["blocks"]) == ("blocks.pomdp", 2**40, 41)
     assert run_json("info", "blocks.pomdp")["observability"] == "full"
     assert run_json("convert", "linear", "flat.mdp", "--set", "size=3", "--no-tasks")["listed"] == 4
     assert run_json("convert", "nursebot", "n.npz", "--no-tasks")["listed"] > 100
@@ -449,3 +449,35 @@ def test_a_pipe_that_closes_early_is_no_traceback(arguments: list[str]) -> None:
     assert process.returncode == 1
     assert "Traceback" not in err
     assert "BrokenPipe" not in err
+
+
+@pytest.mark.parametrize("kind", ["q", "value", "action"])
+def test_a_plan_stored_over_classes_acts_alike(run_json: Run, run_text: Run, kind: str) -> None:
+    whole = run_json("plan", "taxi", "--set", "size=3", "-o", "whole.polca")
+    less = run_json("plan", "taxi", "--set", "size=3", "-o", "less.polca", "--store", kind)
+    assert less["stored"]["by"] == kind
+    assert less["stored"]["blocks"] == sum(row["blocks"] for row in whole["tasks"])
+    assert less["stored"]["classes"] == sum(row["value_classes"][kind] for row in whole["tasks"])
+    assert less["stored"]["classes"] < less["stored"]["blocks"]
+    for name in ("whole", "less"):
+        run_json("simulate", f"{name}.polca", "--episodes", "50")
+    assert without_times(run_json("simulate", "whole.polca", "--episodes", "50")) == without_times(
+        run_json("simulate", "less.polca", "--episodes", "50")
+    )
+    shown = run_text("plan", "toy", "-o", "toy.polca", "--store", kind, "-q")
+    assert f"stored by {kind}: " in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("plan", "toy", "--store", "q"), "give -o PLAN too"),
+        (("plan", "tiger", "--store", "q", "-o", "x.polca"), "whose state is seen"),
+        (("plan", "toy", "--store", "q", "-o", "x.polca", "--interchangeable"), "needs actions by name"),
+    ],
+)
+def test_what_cannot_be_stored_over_classes_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str
+) -> None:
+    assert main(list(arguments)) == 2
+    assert said in capsys.readouterr().err

@@ -18,8 +18,9 @@ from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.minimiser import minimise as minimise_named
 from factored_polca.explicit.minimiser import minimise_interchangeable
 from factored_polca.hierarchy import Options, plan
+from factored_polca.hierarchy.evaluation import expectation
 from factored_polca.hierarchy.executable import composed_policy, executable
-from factored_polca.hierarchy.plan import expectation, plan_mdp
+from factored_polca.hierarchy.plan import plan_mdp
 from factored_polca.library import load
 from factored_polca.minimisation import (
     Choice,

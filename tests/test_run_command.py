@@ -305,7 +305,9 @@ def test_json_is_one_object_and_the_dialogue_on_stderr(say: Say) -> None:
     data = json.loads(out)
     assert status == 0
     assert "observed: growl=left" in err
-    assert set(data) == {"model", "tracker", "tracker_reason", "steps", "ended", "log_likelihood"}
+    assert set(data) == {
+        "model", "tracker", "tracker_reason", "steps", "ended", "log_likelihood", "peak_memory_bytes",
+    }  # fmt: skip
     first, pending = data["steps"]
     assert first["action"] == "listen"
     assert first["likelihood"] == pytest.approx(0.5)
@@ -446,7 +448,7 @@ def test_names_of_strangers_can_do_nothing_to_the_terminal(say: Say) -> None:
 
 SIMULATED = {
     "mean", "standard_error", "episodes", "steps", "ended", "truncation", "planned_value", "seed",
-    "tracker", "tracker_reason", "action_counts",
+    "tracker", "tracker_reason", "action_counts", "peak_memory_bytes",
 }  # fmt: skip
 
 

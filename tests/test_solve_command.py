@@ -332,7 +332,7 @@ def test_simulate_tells_policies_from_plans(run_json: Run, run_text: Run) -> Non
     data = run_json("simulate", "paid.policy", "--episodes", "20", "--seed", "4")
     assert data.keys() == {
         "mean", "standard_error", "episodes", "steps", "ended", "truncation", "planned_value",
-        "planned_lower", "planned_upper", "seed",
+        "planned_lower", "planned_upper", "seed", "peak_memory_bytes",
     }  # fmt: skip
     assert data["mean"] == data["planned_value"] == pytest.approx(2.71)
     assert (data["steps"], data["truncation"], data["standard_error"]) == (3, 0, pytest.approx(0))

@@ -27,7 +27,7 @@ from factored_polca.models import (
     lottery,
     parse,
 )
-from factored_polca.symbolic import ORDERS, NumericView, compile_model, variable_order
+from factored_polca.symbolic import ORDERS, NumericView, compile_model, descent, variable_order
 from factored_polca.symbolic.forward import ForwardRegression, looks_up
 
 
@@ -86,6 +86,40 @@ def test_regression_from_the_top_down_equals_the_sum_over_next_states(seeds: ran
                     residue = total.numerator * pow(total.denominator, -1, field.prime) % field.prime
                     assert regressed[s] == residue, (seed, a, s)
     assert done > len(seeds) // 4
+
+
+@chunks()
+def test_regression_with_rows_going_along_equals_the_sum_over_next_states(
+    seeds: range, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descent, "MANY", 1)  # these models are small
+    monkeypatch.setattr(descent, "CARRIED", 99)
+    done, cuts = 0, 0
+    for seed in seeds:
+        found, random = case(seed), Random(seed)
+        field = Field(random_prime(random))
+        palette = [0] * random.choice((0, 1, 9)) + [
+            random.randrange(field.prime) for _ in range(random.choice((2, 40)))
+        ]
+        values = [random.choice(palette) for _ in range(found.exact.states)]
+        numbers = NumericView(found.symbolic, field)
+        diagram = found.diagram(values, field)
+        plain = [a for a, action in enumerate(found.symbolic.actions) if not action.synchronic]
+        known: descent.Cuts = {}
+        descents = descent.Descents(numbers, plain, known)
+        cuts += sum(None in cut.exact for cut in known.values())
+        for place, a in enumerate(plain):
+            if not found.symbolic.actions[a].rows:
+                continue
+            done += 1
+            regressed = found.at(descents.regress(place, diagram))
+            for s, row in enumerate(found.exact.rows[a]):
+                if found.exact.applicable[a][s]:
+                    total = probability_sum(row, values)
+                    residue = total.numerator * pow(total.denominator, -1, field.prime) % field.prime
+                    assert regressed[s] == residue, (seed, a, s)
+    assert done > len(seeds) // 4
+    assert cuts > len(seeds) // 8  # rows that look below their own level
 
 
 @chunks()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from factored_polca.cli.memory import current_memory_bytes, memory_text, peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, make_table, seconds
 from factored_polca.cli.source import Source, UsageError, load, parse_actions
 from factored_polca.formats import destination
@@ -25,21 +25,6 @@ ACTIONS_SHOWN = 30
 
 SMALLEST_STORE = 1 << 20
 """Bytes without which no model fits."""
-
-
-def peak_memory_bytes() -> int:
-    """The largest resident set of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
-
-
-def current_memory_bytes() -> int:
-    """The resident set now, or its peak where the system does not say."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[1]) * resource.getpagesize()
-    except OSError:
-        return peak_memory_bytes()
 
 
 def compile_kernels(output: Output, pomdp_method: str | None = None) -> float:
@@ -123,8 +108,10 @@ def report_warnings(source: Source, output: Output) -> None:
 
 def minimise(arguments: argparse.Namespace, output: Output) -> int:
     """Minimise a model, print the figures."""
+    from factored_polca.cli.sensitivity import kept_symbols, parameter_data
     from factored_polca.minimisation import flat_process, observation_counts
     from factored_polca.minimisation import minimise as minimise_process
+    from factored_polca.parametric import parametric_process
     from factored_polca.symbolic import compile_model
     from factored_polca.symbolic.reach import reachable_states
 
@@ -132,7 +119,10 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
         raise UsageError(
             "--certify checks partitions that keep actions by name, not --interchangeable ones"
         )
-    source = load(arguments.model, arguments.set)
+    names = arguments.keep_parameters
+    if names is not None and arguments.certify:
+        raise UsageError("--certify checks rows of numbers, and --keep-parameters leaves symbols in them")
+    source = load(arguments.model, arguments.set, None, names)
     actions = None if arguments.actions is None else parse_actions(arguments.actions, source.model)
     report_warnings(source, output)
     compile_seconds = compile_kernels(output)
@@ -140,8 +130,9 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
     data: dict[str, Any] = {"model": source.model.name, "states": source.model.states}
     began = time.perf_counter()
     with source.located(), output.progress(f"minimising {source.name}"):
+        symbols = None if names is None else kept_symbols(source.model, names)
         symbolic = compile_model(
-            source.model, order=arguments.order, memory_limit=memory, deadline=deadline
+            source.model, order=arguments.order, memory_limit=memory, deadline=deadline, parameters=symbols
         )
         reachable = None
         if arguments.reachable:
@@ -149,6 +140,10 @@ def minimise(arguments: argparse.Namespace, output: Output) -> int:
             reachable = found.diagram
             data["reachable_states"] = found.states
         process = flat_process(symbolic, actions, reachable)
+        if symbols is not None:
+            opened = parametric_process(process)
+            process = opened.process
+            data |= parameter_data(opened)
         result = minimise_process(
             process,
             seed=arguments.seed,
@@ -208,6 +203,9 @@ def print_minimisation(data: dict[str, Any], output: Output) -> None:
     if "reachable_states" in data:
         table.add_row("reachable states", big(data["reachable_states"]))
     table.add_row("blocks", f"{data['blocks']:,}")
+    if "parameters" in data:
+        table.add_row("symbols", escape(", ".join(data["parameters"])))
+        table.add_row("admissible", escape("; ".join(data["region"]) or "everywhere"))
     table.add_row("rounds", f"{data['rounds']:,}")
     table.add_row("diagram nodes (peak)", f"{data['nodes']:,} ({data['peak_nodes']:,})")
     table.add_row("chance of an unseen split", f"below {data['collision_bound']:.1g}")
@@ -219,7 +217,7 @@ def print_minimisation(data: dict[str, Any], output: Output) -> None:
         )
     table.add_row("time", seconds(data["seconds"]))
     table.add_row("kernels loaded or compiled", seconds(data["compile_seconds"]))
-    table.add_row("peak memory", f"{data['peak_memory_bytes'] / 2**20:,.0f} MiB")
+    table.add_row("peak memory", memory_text(data["peak_memory_bytes"]))
     output.table(table)
     if "observations" in data:
         print_observations(data["observations"], output)

@@ -18,6 +18,13 @@ from factored_polca.models.errors import LimitReached, ModelError
 if TYPE_CHECKING:
     from factored_polca.cli.output import Output
 
+WITH_PROCESSES = ("bench", "study")
+"""Commands that work in other processes than their own."""
+
+MEMORY_NOTED = ("check", "convert", "plan", "simulate", "run", "compare", "figure", *WITH_PROCESSES)
+"""Commands that say at their end how much memory they took: all that work more than a moment, but for
+those that have it in their table."""
+
 
 def commands() -> dict[str, Callable[..., int]]:
     """The functions behind the commands; importing them loads the libraries they need."""
@@ -29,6 +36,7 @@ def commands() -> dict[str, Callable[..., int]]:
         "convert": models.convert, "minimise": work.minimise, "plan": plan.plan, "act": act.act,
         "run": run_plan, "simulate": simulate.simulate, "solve": solve.solve,
         "figure": figure.figure, "bench": run_bench, "study": run_study, "compare": compare.compare,
+        "sensitivity": run_sensitivity,
     }  # fmt: skip
 
 
@@ -44,6 +52,13 @@ def run_study(arguments: argparse.Namespace, output: Output) -> int:
     from factored_polca.cli.study import study as work
 
     return work(arguments, output)
+
+
+def run_sensitivity(arguments: argparse.Namespace, output: Output) -> int:
+    """The command `sensitivity`."""
+    from factored_polca.cli.sensitivity import sensitivity
+
+    return sensitivity(arguments, output)
 
 
 def run_bench(arguments: argparse.Namespace, output: Output) -> int:
@@ -95,13 +110,20 @@ def guarded(parsed: argparse.Namespace) -> int:
     What no one can mend but us is said too, with the status 1; with the variable
     FACTORED_POLCA_TRACEBACK set it comes with the traceback that a report of the fault needs.
     """
+    from factored_polca.cli.memory import memory_backstop, memory_text
     from factored_polca.cli.output import Output
     from factored_polca.cli.source import UsageError
     from factored_polca.diagrams import Aborted, MemoryLimit
 
-    output = Output(parsed.json, parsed.quiet)
+    output = Output(parsed.json, parsed.quiet, children=parsed.command in WITH_PROCESSES)
+    memory: int | None = getattr(parsed, "memory", None)
     try:
-        return commands()[parsed.command](parsed, output)
+        work = commands()[parsed.command]
+        with memory_backstop(memory):
+            status = work(parsed, output)
+        if parsed.command in MEMORY_NOTED and not parsed.json:
+            output.note(f"peak memory {memory_text(output.peak_memory_bytes())}")
+        return status
     except BrokenPipeError:
         raise
     except ModelError as error:
@@ -117,7 +139,10 @@ def guarded(parsed: argparse.Namespace) -> int:
         output.error(f"limit reached: {error}")
         return 3
     except MemoryError:
-        output.error("limit reached: out of memory; give --memory to stop earlier and more gently")
+        reason = "out of memory; give --memory to stop earlier and more gently"
+        if memory is not None:
+            reason = f"the {memory_text(memory)} of --memory are used up; give more, or a smaller model"
+        output.error(f"limit reached: {reason}")
         return 3
     except Exception as error:
         if os.environ.get("FACTORED_POLCA_TRACEBACK"):

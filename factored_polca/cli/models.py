@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import secrets
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -227,7 +228,7 @@ def check(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set)
     faults: list[Fault] = []
     try:
-        symbolic = compile_model(source.model)
+        symbolic = compile_model(source.model, deadline=deadline(arguments))
         faults += check_undiscounted(symbolic)
     except ModelError as error:
         faults += error.faults
@@ -250,6 +251,11 @@ def check(arguments: argparse.Namespace, output: Output) -> int:
     if faults and not arguments.json:
         raise ModelError(faults)
     return 2 if faults else 0
+
+
+def deadline(arguments: argparse.Namespace) -> float | None:
+    """When `--time` is over, by the monotonic clock."""
+    return None if arguments.time is None else time.monotonic() + arguments.time
 
 
 FLAT = (".pomdp", ".mdp", ".npz")
@@ -298,7 +304,7 @@ def write_flat(
 
     compile_kernels(output)
     with source.located():
-        flat = flat_model(compile_model(source.model))
+        flat = flat_model(compile_model(source.model, deadline=deadline(arguments)))
     count = flat.pomdp.states
     if extension == ".npz":
         write_npz(pomdp_fields(flat.pomdp), arguments.output)
@@ -324,7 +330,8 @@ def write_quotient(
         format_of(arguments.output)
     compile_kernels(output)
     with source.located(), output.progress(f"minimising {source.name}"):
-        quotient = reduce(flat_process(compile_model(source.model))).quotient
+        symbolic = compile_model(source.model, deadline=deadline(arguments))
+        quotient = reduce(flat_process(symbolic)).quotient
     first = {"first_step": True} if arguments.first_step and isinstance(quotient, PomdpQuotient) else {}
     if extension == ".npz":
         quotient.to_npz(arguments.output)

@@ -17,15 +17,17 @@ from rich.measure import Measurement
 from rich.status import Status
 from rich.table import Table
 
+from factored_polca.cli.memory import peak_memory_bytes
+
 PIPE_WIDTH = 200
 """Columns of a table that goes to a file or a pipe, where nobody told COLUMNS."""
 
 
 class Output:
-    """Where a command writes."""
+    """Where a command writes; `children` says that it has others work for it, whose memory counts too."""
 
-    def __init__(self, as_json: bool, quiet: bool) -> None:
-        self.as_json, self.quiet = as_json, quiet
+    def __init__(self, as_json: bool, quiet: bool, *, children: bool = False) -> None:
+        self.as_json, self.quiet, self.children = as_json, quiet, children
         self.out, self.err = console(sys.stdout), console(sys.stderr)
         self._status: Status | None = None
 
@@ -63,10 +65,18 @@ class Output:
             self._status.update(escape(text))
 
     def result(self, data: Mapping[str, Any]) -> None:
-        """Print the one JSON object; its integers are exact, however long."""
+        """Print the one JSON object; its integers are exact, however long.
+
+        Every command's has `peak_memory_bytes`: that of its process, if the command says nothing else.
+        """
+        whole = {"peak_memory_bytes": self.peak_memory_bytes()} | dict(data)
         with any_integer():
-            text = json.dumps(finite(data), allow_nan=False)
+            text = json.dumps(finite(whole), allow_nan=False)
         sys.stdout.write(text + "\n")
+
+    def peak_memory_bytes(self) -> int:
+        """The most memory that a process of the command has taken."""
+        return peak_memory_bytes(children=self.children)
 
     def table(self, table: Table) -> None:
         """Print a table on stdout, wider than the terminal rather than with numbers cut."""

@@ -20,6 +20,7 @@ from factored_polca.cli.argument_types import (
 )
 from factored_polca.cli.bench_arguments import add_bench
 from factored_polca.cli.compare_arguments import add_comparing
+from factored_polca.cli.sensitivity_arguments import add_keeping, add_sensitivity
 from factored_polca.cli.study_arguments import add_study
 
 DESCRIPTION = """Plan factored Markov decision processes, their state seen or not, with task
@@ -100,9 +101,12 @@ def parser() -> argparse.ArgumentParser:
             help="set a parameter; may be repeated",
         )
 
+    def with_memory(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit, such as 2GB")
+
     def with_limits(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("--seed", type=natural, default=0, metavar="S", help="seed of random draws (0)")
-        sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit, such as 2GB")
+        with_memory(sub)
         sub.add_argument("--time", type=positive, metavar="SECONDS", help="time limit")
         sub.add_argument("--order", default="auto", choices=ORDERS, help="order of the diagrams' variables")
         sub.add_argument("--reachable", action="store_true", help="only states that the start can reach")
@@ -110,12 +114,16 @@ def parser() -> argparse.ArgumentParser:
     command("domains", "List the shipped domains.")
     command("new", "Write a commented model to start from.").add_argument("name", metavar="NAME")
     with_model(command("info", "Describe a model, or a domain and its parameters."))
-    with_model(command("check", "Check a model and its tasks, and report all faults at once."))
+    sub = command("check", "Check a model and its tasks, and report all faults at once.")
+    with_model(sub)
+    with_memory(sub)
+    sub.add_argument("--time", type=positive, metavar="SECONDS", help="time limit of compiling the model")
     sub = command("minimise", "Merge the states that behave alike, exactly.")
     with_model(sub)
     with_limits(sub)
     sub.add_argument("--actions", metavar="A,B,...", help="only these actions count")
     sub.add_argument("--certify", action="store_true", help="check the partition without fingerprints")
+    add_keeping(sub)
     sub.add_argument(
         "--interchangeable", action="store_true",
         help="actions count by what they do, not by name (where the state is seen)",
@@ -125,6 +133,11 @@ def parser() -> argparse.ArgumentParser:
     with_limits(sub)
     sub.add_argument("--tasks", metavar="FILE", help="take the tasks from this .toml file")
     sub.add_argument("-o", "--output", metavar="PLAN", help="write the plan to a file")
+    sub.add_argument(
+        "--store", default="blocks", choices=("blocks", "q", "value", "action"),
+        help="write policies over states of equal Q-values, of equal value and action, or of equal action, "
+        "not over blocks (where the state is seen)",
+    )  # fmt: skip
     sub.add_argument(
         "--discount", type=discount, metavar="D",
         help="plan without end, with this discount: in place of the model's discount and horizon",
@@ -162,6 +175,7 @@ def parser() -> argparse.ArgumentParser:
     group.add_argument("--polca", action="store_true", help="plan as if the state were seen: PolCA")
     sub = command("solve", "Solve a model as it is, partially observed or not, without a hierarchy.")
     with_model(sub)
+    with_memory(sub)
     add_solving(sub)
     sub = command("act", "Say what a plan does in a state, or at a belief, and why.")
     sub.add_argument("plan", metavar="PLAN")
@@ -196,8 +210,16 @@ def parser() -> argparse.ArgumentParser:
     add_study(
         command("study", "Grids of runs with hard limits that survive being stopped; tables and plots.")
     )
+    sub = command("sensitivity", "The optimal value as a function of parameters, from one minimisation.")
+    with_model(sub)
+    with_limits(sub)
+    add_sensitivity(sub)
     sub = command("convert", "Write a model in another format, chosen by the extension.")
     with_model(sub)
+    with_memory(sub)
+    sub.add_argument(
+        "--time", type=positive, metavar="SECONDS", help="time limit of compiling and minimising the model"
+    )
     sub.add_argument("output", metavar="OUT")
     sub.add_argument("--no-tasks", action="store_true", help="leave the tasks out")
     sub.add_argument("--minimise", action="store_true", help="write the quotient: a state for each block")
@@ -216,7 +238,6 @@ def add_solving(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--gap", type=gap, metavar="G", help="stop at upper - lower <= G at the start")
     sub.add_argument("--epsilon", type=gap, metavar="E", help="the same as --gap")
     sub.add_argument("--time", type=positive, metavar="SECONDS", help="solve no longer than that")
-    sub.add_argument("--memory", type=size, metavar="SIZE", help="memory limit of diagrams, such as 2GB")
     sub.add_argument("--iterations", type=counting, metavar="N", help="no more than N of the solver's")
     sub.add_argument(
         "--horizon", type=horizon, metavar="H", help="steps, or infinite; the model's if not given"

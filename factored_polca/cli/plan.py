@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from factored_polca.cli.commands import (
     compile_kernels,
     limits,
-    peak_memory_bytes,
     refuse_unwritable,
     report_warnings,
 )
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
-from factored_polca.cli.source import Source, load
+from factored_polca.cli.source import Source, UsageError, load
 from factored_polca.models import LimitReached, ModelError
 from factored_polca.models.model import replace_fields
 
@@ -35,6 +35,8 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     source = load(arguments.model, arguments.set, arguments.tasks)
     source = overridden(source, arguments, output)
     partial = source.model.observability == "partial" and not arguments.polca
+    if arguments.store != "blocks":
+        refuse_store(arguments, partial)
     if arguments.polca and source.model.observability == "full":
         output.note("the state is seen: --polca changes nothing")
     report_warnings(source, output)
@@ -50,6 +52,18 @@ def plan(arguments: argparse.Namespace, output: Output) -> int:
     if arguments.output is not None:
         output.note(f"plan written to {arguments.output}; try: factored-polca simulate {arguments.output}")
     return 0
+
+
+def refuse_store(arguments: argparse.Namespace, partial: bool) -> None:
+    """Refuse `--store` where there is nothing to store so, before the work."""
+    if partial:
+        raise UsageError(
+            "--store is for plans whose state is seen; policies of beliefs are kept as they are"
+        )
+    if arguments.output is None:
+        raise UsageError("--store says what is written: give -o PLAN too")
+    if arguments.interchangeable and arguments.store == "q":
+        raise UsageError("--store q needs actions by name, not --interchangeable: use value or action")
 
 
 def overridden(source: Source, arguments: argparse.Namespace, output: Output) -> Source:
@@ -117,7 +131,15 @@ def plan_full(
     data = plan_report(found) | figures(arguments, source, compile_seconds)
     for warning in found.warnings:
         output.warn(warning)
-    if arguments.output is not None:
+    if arguments.output is not None and arguments.store != "blocks":
+        from factored_polca.hierarchy.irrelevance import executable_by_classes
+
+        stored = executable_by_classes(found, arguments.store, finite(data))
+        blocks = sum(row["blocks"] for row in data["tasks"])
+        classes = sum(policy.partition.blocks for policy in stored.policies.values())
+        data["stored"] = {"by": arguments.store, "classes": classes, "blocks": blocks}
+        save_plan(stored, arguments.output)
+    elif arguments.output is not None:
         save_plan(executable(found, finite(data)), arguments.output)
     return data
 
@@ -231,6 +253,10 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         cost = data["flat_value"] - data["value"]
         said = "nothing" if abs(cost) <= 1e-9 * max(1, abs(data["flat_value"])) else f"{cost:.6g}"
         output.line(f"flat optimum: {data['flat_value']:.9g}; the hierarchy costs {said}")
+    if "stored" in data:
+        stored = data["stored"]
+        classes, blocks = f"{stored['classes']:,}", f"{stored['blocks']:,}"
+        output.line(f"stored by {stored['by']}: {classes} classes in place of {blocks} blocks")
     output.line(f"guarantee: {escape(data['guarantee'])}")
 
 

@@ -14,10 +14,10 @@ import numpy as np
 from factored_polca.cli.commands import (
     compile_kernels,
     limits,
-    peak_memory_bytes,
     refuse_unwritable,
     report_warnings,
 )
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
 from factored_polca.cli.solve_symbolic import (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factored_polca.cli.commands import peak_memory_bytes
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
 from factored_polca.cli.source import Source
@@ -207,8 +207,8 @@ def over_blocks(
     """
     from factored_polca.cli.solve import MDP_EPSILON
     from factored_polca.diagrams import MemoryLimit
+    from factored_polca.hierarchy.evaluation import describe_block, expectation
     from factored_polca.hierarchy.options import STRUCTURED_BLOCKS
-    from factored_polca.hierarchy.plan import describe_block, expectation
     from factored_polca.minimisation import reduce
     from factored_polca.solvers import solve_mdp
 

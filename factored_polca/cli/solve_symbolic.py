@@ -7,7 +7,8 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, Final
 
-from factored_polca.cli.commands import compile_kernels, limits, peak_memory_bytes
+from factored_polca.cli.commands import compile_kernels, limits
+from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
 from factored_polca.cli.solve_report import status_text, value_text
 from factored_polca.cli.source import Source, UsageError

@@ -40,8 +40,12 @@ class Source:
             raise ModelError(self.locate(error.faults)) from None
 
 
-def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> Source:
+def load(
+    text: str, settings: Sequence[str] = (), tasks: str | None = None, keep: Sequence[str] | None = None
+) -> Source:
     """The model that MODEL names: a file, or else a shipped domain.
+
+    `keep` names parameters of a domain that become parameters of the model; without names all numbers do.
 
     Raises:
         ModelError: neither, or not a right model.
@@ -57,7 +61,9 @@ def load(text: str, settings: Sequence[str] = (), tasks: str | None = None) -> S
         model, hierarchy, warnings = document.model, document.tasks, document.warnings
         locate = document.locate
     elif text in library.domains():
-        domain = library.load(text, parameters)
+        if keep is not None and not keep:
+            keep = library.numeric_parameters(text)
+        domain = library.load(text, parameters, keep=keep or ())
         name, model, hierarchy = text, domain.model, domain.tasks
     else:
         domains, extensions = ", ".join(library.domains()), ", ".join(FORMATS)

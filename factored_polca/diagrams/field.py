@@ -140,6 +140,8 @@ class Field:
         Raises:
             ZeroDivisionError: the denominator is divisible by p.
         """
+        if value.denominator == 1:
+            return self.encode(value.numerator)
         denominator = value.denominator % self.prime
         if denominator == 0:
             raise ZeroDivisionError(f"the denominator of {value} is divisible by the prime {self.prime}")
@@ -148,6 +150,6 @@ class Field:
     def draw(self, generator: np.random.Generator, count: int) -> UInt64Array:
         """`count` distinct random non-zero elements in stored form [count]."""
         drawn = generator.integers(1, self.prime, size=count, dtype=np.uint64)
-        while len(np.unique(drawn)) < count:
+        while (np.diff(np.sort(drawn)) == 0).any():
             drawn = generator.integers(1, self.prime, size=count, dtype=np.uint64)
         return drawn

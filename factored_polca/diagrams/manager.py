@@ -47,6 +47,22 @@ class Aborted(RuntimeError):
 
 
 def available_memory() -> int:
+    """Bytes of memory that this process may still take: what is free, or less where it has a limit."""
+    free = _free_memory()
+    try:
+        import resource  # not everywhere
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
+        if limit == resource.RLIM_INFINITY:
+            return free
+        with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+            taken = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData:"))
+    except (ImportError, OSError, StopIteration):
+        return free
+    return max(0, min(free, limit - taken))
+
+
+def _free_memory() -> int:
     """Bytes of memory that are free now, or 4 GiB where the system does not say."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
@@ -148,8 +164,11 @@ class Manager:
 
     def constant(self, value: int | float, leaf_type: LeafType = INDEX) -> Diagram:
         """The diagram that is `value` everywhere; for a field an integer mod p."""
-        payload = leaf_type.encode(value)  # type: ignore[arg-type]
-        return self.handle(int(self.leaf_nodes(np.array([payload], dtype=np.uint64))[0]), leaf_type)
+        return self.stored_constant(leaf_type.encode(value), leaf_type)  # type: ignore[arg-type]
+
+    def stored_constant(self, stored: int, leaf_type: LeafType) -> Diagram:
+        """The diagram that has everywhere the leaf whose payload is `stored`."""
+        return self.handle(int(self.leaf_nodes(np.array([stored], dtype=np.uint64))[0]), leaf_type)
 
     def variable(self, level: int, children: Sequence[Diagram]) -> Diagram:
         """The diagram that is `children[v]` where the variable at `level` has its value v.

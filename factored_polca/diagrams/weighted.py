@@ -182,6 +182,18 @@ def settle(
     return find_or_add(pool, head, unique, arity, leaf_level, terms, free), kept, top, normalised
 
 
+@inline
+def begin_sum(stack: Int32Array, state: Int64Array, count: int, normalised: int) -> None:
+    """The frame of a sum of the first `count` terms, as `run_weighted_sum` takes it."""
+    stack[0] = 0
+    stack[1] = count
+    stack[2] = -1
+    stack[3] = 0
+    stack[4] = normalised
+    state[0] = 1
+    state[1] = 0
+
+
 @lean_kernel
 def run_weighted_sum(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array,
@@ -332,13 +344,7 @@ def run_regression(
                 terms[2 * v + 1] = zero
                 if weight != zero:
                     terms[2 * v + 1] = regressed[pool[pool[node + 2 + v] + 1]]
-            stack[0] = 0
-            stack[1] = d
-            stack[2] = -1
-            stack[3] = 0
-            stack[4] = options[NORMALISED]
-            state[0] = 1
-            state[1] = 0
+            begin_sum(stack, state, int64(d), options[NORMALISED])
             progress[1] = 1
         code = run_weighted_sum(
             pool, head, unique, arity, slots, ring, ring_state, options, field,

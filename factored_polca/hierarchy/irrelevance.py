@@ -18,6 +18,9 @@ Values come from a solver with bounds lower <= V* <= upper in each block.  Value
 lie within `within` of each other, by default the width in which ties are decided, 1e-9 max(1, |V|), and the
 solver's gap; a class carries the hull of its blocks' bounds, and `width` is the widest hull, the price paid
 in what is said of V*.
+
+Where the task was planned with near states merged (`factored_polca.approximation`), V* and Q* are those of
+the merged process.
 """
 
 from __future__ import annotations

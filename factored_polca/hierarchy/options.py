@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Final
 
 from factored_polca.minimisation.pomdp_quotient import MAXIMUM_OBSERVATIONS
@@ -38,6 +39,11 @@ class Options:
     `assume_observed` plans a partially observed model as if the state were seen (PolCA).
 
     `interchangeable` tells actions by what they do and not by their names, where the state is seen.
+
+    `merge_within` merges states that are near (`factored_polca.approximation`): rows of probabilities
+    within this total variation, values within this share of their span; from 0 to below 1, a float as it
+    is written.  None is exact abstraction.  Losses are bounded, and measured where the exact quotients have
+    no more than `flat_block_limit` blocks.
     """
 
     seed: int = 0
@@ -54,4 +60,5 @@ class Options:
     maximum_observations: int = MAXIMUM_OBSERVATIONS
     assume_observed: bool = False
     interchangeable: bool = False
+    merge_within: Fraction | float | str | None = None
     structured_blocks: int | None = STRUCTURED_BLOCKS

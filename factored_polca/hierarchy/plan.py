@@ -24,6 +24,19 @@ from factored_polca.diagrams import INDEX, Diagram, MemoryLimit, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
 from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
+from factored_polca.hierarchy.evaluation import (
+    Evaluation,
+    describe_block,
+    evaluate,
+    evaluate_structured,
+    expectation,
+)
+from factored_polca.hierarchy.merging import (
+    CertifiedBounds,
+    merging_for,
+    policy_chain,
+    seen_flat_process,
+)
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan, plan_pomdp
 from factored_polca.hierarchy.solved import AnySolvedTask, SolvedTask, StructuredTask
@@ -37,8 +50,7 @@ from factored_polca.hierarchy.structured_task import (
 )
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.hierarchy.task_warnings import task_warnings
-from factored_polca.minimisation import Choice, DecisionProcess, Reduction, flat_process, reduce
-from factored_polca.minimisation.criterion import policy_primitives
+from factored_polca.minimisation import DecisionProcess, Reduction, reduce
 from factored_polca.minimisation.polynomial import interchangeable_fault
 from factored_polca.minimisation.reduction import InterchangeableReduction
 from factored_polca.models import (
@@ -50,25 +62,13 @@ from factored_polca.models import (
     TaskHierarchy,
     flat_task,
 )
-from factored_polca.solvers import Guarantee, MDPSolution, solve_mdp
+from factored_polca.solvers import MDPSolution, solve_mdp
 from factored_polca.solvers.pomdp_result import Demand
 from factored_polca.solvers.protocol import MdpSolver, call_mdp_solver
-from factored_polca.structured.solution import StructuredSolution
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 Progress = Callable[[str, str, int, int], None]
 """Called with (task, stage, round, blocks)."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The value of something at the initial belief: bounds, and how it was found."""
-
-    value: float
-    lower: float
-    upper: float
-    blocks: int | None  # None: found on diagrams
-    guarantee: Guarantee
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class HierarchicalPlan(DrawnGraph, Framed):
 
     `solved` lists the tasks children first, the root last.  `polled` is the value of the polled
     policy under the model's own reward; `flat` the optimum without hierarchy, None where it was
-    left out, and `flat_note` says why.
+    left out, and `flat_note` says why.  Where near states were merged, `certified` bounds both without
+    exact quotients.
     """
 
     symbolic: SymbolicModel
@@ -88,6 +89,7 @@ class HierarchicalPlan(DrawnGraph, Framed):
     flat_note: str
     seconds: float
     warnings: tuple[str, ...] = field(default=())
+    certified: CertifiedBounds | None = None
 
     def __repr__(self) -> str:
         tasks, worth = len(self.solved), self.polled.value
@@ -164,15 +166,8 @@ def plan_mdp(
     options = options or Options()
     began = time.perf_counter()
     if model.observability != "full" and not options.assume_observed:
-        raise ModelError(
-            [
-                Fault(
-                    "the model is partially observed",
-                    ("observability",),
-                    "plan_pomdp plans it; with assume_observed it is planned as if the state were seen",
-                )
-            ]
-        )
+        hint = "plan_pomdp plans it; with assume_observed it is planned as if the state were seen"
+        raise ModelError([Fault("the model is partially observed", ("observability",), hint)])
     if model.horizon is not None:
         hint = "remove it and give a discount (plan --discount D), or use solve"
         raise ModelError([Fault("a finite horizon can't be planned for", ("horizon",), hint)])
@@ -189,13 +184,15 @@ def plan_mdp(
         planner.solve(task)
     root = planner.solved[planning_order(hierarchy)[-1].name]
     refuse_unavoidable_dead_ends(root)
-    polled = planner.polled(root)
+    certified = planner.certified(root)
+    polled = planner.polled(root, certified)
     flat, note = planner.flat(root)
     warnings = tuple(w for solved in planner.solved.values() for w in solved.warnings)
     seconds = time.perf_counter() - began
     return HierarchicalPlan(
-        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings
-    )
+        symbolic, hierarchy, tuple(planner.solved.values()), polled, flat, note, seconds, warnings,
+        certified,
+    )  # fmt: skip
 
 
 class _Planner:
@@ -212,6 +209,7 @@ class _Planner:
         self.options, self.progress = options, progress
         self.solved: dict[str, AnySolvedTask] = {}
         self.custom = None if options.assume_observed else custom_solver(options.solver)
+        self.merging = merging_for(symbolic, options)
         self.reachable: Diagram | None = None
         if options.reachable:
             from factored_polca.symbolic.reach import reachable_states
@@ -231,6 +229,21 @@ class _Planner:
             block_limit=block_limit,
             progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
             interchangeable=self.options.interchangeable and len(process.choices) > 1,
+        )
+
+    def merged(
+        self, name: str, process: DecisionProcess, method: str, custom: MdpSolver | None
+    ) -> Reduction | str:
+        """A task's reduction: exact, or of a process near it; or why it is to be solved on diagrams."""
+        if self.merging is None:
+            return self.reduced(name, process, method, custom)
+        if method == STRUCTURED:
+            message = f"task {name!r}: merging near states needs blocks, and {STRUCTURED!r} makes none"
+            raise ModelError([Fault(message, ("tasks", name, "solver"), "choose one of them")])
+        return self.merging.reduce(
+            process,
+            self.options.block_limit,
+            lambda number, blocks: self.tell(name, "merge", number, blocks),
         )
 
     def optimise(
@@ -269,11 +282,12 @@ class _Planner:
         )
         process = subtask_process(self.symbolic, task, self.solved, self.reachable)
         custom = self.custom if task.solver is None else None
-        reduction = self.reduced(task.name, process, method, custom)
+        reduction = self.merged(task.name, process, method, custom)
         if isinstance(reduction, str):
             self.solved[task.name] = self.on_diagrams(task, process, reduction)
             return
-        refuse_without_purpose(task, reduction.mdp)
+        if self.merging is None or not self.merging.has_purpose(process):
+            refuse_without_purpose(task, reduction.mdp)
         solution = self.optimise(task.name, reduction, method, custom)
         if isinstance(reduction, InterchangeableReduction):
             counts = count_exchanged(reduction.exchanged)
@@ -284,10 +298,15 @@ class _Planner:
         defined = relabel(reduction.partition.diagram, chosen, INDEX)
         dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
         value = expectation(reduction.project_initial(), solution.values)
+        approximation = None
+        if self.merging is not None:
+            self.tell(task.name, "certify", 0, reduction.partition.blocks)
+            approximation = self.merging.certify(reduction, solution, policy, defined)
         self.solved[task.name] = SolvedTask(
             task, reduction, solution, policy, defined, counts, value,
             time.perf_counter() - began, dead,
             task_warnings(task, reduction, solution, dead, is_child=task not in self.hierarchy.roots()),
+            approximation,
         )  # fmt: skip
         self.tell(task.name, "done", 0, reduction.partition.blocks)
 
@@ -323,15 +342,41 @@ class _Planner:
         self.tell(task.name, "done")
         return solved
 
-    def polled(self, root: AnySolvedTask) -> Evaluation:
+    def polled(self, root: AnySolvedTask, certified: CertifiedBounds | None) -> Evaluation:
         """The value of the polled policy under the model's reward."""
-        process = root.process
-        taken = policy_primitives(root.policy, root.defined, len(self.symbolic.actions))
-        choice = Choice("polled policy", root.defined, taken, root.policy)
-        rewards = {p: self.symbolic.actions[p].rewards for p in taken}
-        chain = DecisionProcess(self.symbolic, (choice,), process.terminal, rewards, process.reachable)
-        method = STRUCTURED if isinstance(root, StructuredTask) else "auto"
-        return self.evaluated("polled policy", chain, self.reduced("polled policy", chain, method))
+        name, chain = "polled policy", self.chain(root)
+        if certified is None:
+            method = STRUCTURED if isinstance(root, StructuredTask) else "auto"
+            return self.evaluated(name, chain, self.reduced(name, chain, method))
+        try:
+            reduction = self.reduce(name, chain, self.options.flat_block_limit or 1)
+        except LimitReached:
+            if certified.polled_lower is None:
+                raise
+            return certified.evaluation()
+        return evaluate(reduction, self.optimise(name, reduction, "auto"))
+
+    def chain(self, root: AnySolvedTask) -> DecisionProcess:
+        """The Markov chain of the polled policy under the model's reward."""
+        rewards = {p: action.rewards for p, action in enumerate(self.symbolic.actions)}
+        process = replace(root.process, symbolic=self.symbolic, rewards=rewards)
+        return policy_chain(process, root.policy, root.defined)
+
+    def certified(self, root: AnySolvedTask) -> CertifiedBounds | None:
+        """Bounds on the polled policy's value and on the flat optimum where near states were merged."""
+        if self.merging is None:
+            return None
+        self.tell("bounds", "certify")
+        flat = seen_flat_process(self.symbolic, root.process.terminal, self.flat_reachable())
+        return self.merging.bounds(self.chain(root), flat)
+
+    def flat_reachable(self) -> Diagram | None:
+        """What the start can reach under all primitive actions, where that is asked for."""
+        if not self.options.reachable:
+            return None
+        from factored_polca.symbolic.reach import reachable_states
+
+        return reachable_states(self.symbolic).diagram
 
     def evaluated(self, name: str, process: DecisionProcess, reduction: Reduction | str) -> Evaluation:
         """The optimum of a process, over blocks or on diagrams."""
@@ -348,18 +393,12 @@ class _Planner:
         names = tuple(action.name for action in self.symbolic.actions)
         task = root.task
         flat_already = len(self.solved) == 1 and task.actions == names and not task.has_pseudo_reward
-        if flat_already:
+        if flat_already and self.merging is None:
             if isinstance(root, StructuredTask):
                 return evaluate_structured(root.solution), "the plan is flat"
             return evaluate(root.reduction, root.solution), "the plan is flat"
-        reachable = None
-        if self.options.reachable:
-            from factored_polca.symbolic.reach import reachable_states
-
-            reachable = reachable_states(self.symbolic).diagram
         try:
-            process = flat_process(self.symbolic, reachable=reachable, terminal=root.process.terminal)
-            process = replace(process, channels=None)
+            process = seen_flat_process(self.symbolic, root.process.terminal, self.flat_reachable())
             reduction: Reduction | str = ASKED_FOR
             if named_solver(self.options.solver) != STRUCTURED:
                 reduction = self.reduce("flat optimum", process, limit)
@@ -367,35 +406,6 @@ class _Planner:
         except LimitReached as error:
             return None, f"left out: {error}"
         return found, "solved over all primitive actions"
-
-
-def expectation(belief: np.typing.NDArray[np.float64], values: np.typing.NDArray[np.float64]) -> float:
-    """sum_k b(k) V(k), where probability 0 times minus infinity is 0."""
-    inside = belief > 0
-    return float(belief[inside] @ values[inside])
-
-
-def evaluate(reduction: Reduction, solution: MDPSolution) -> Evaluation:
-    """The value of a solution at the initial belief."""
-    belief = reduction.project_initial()
-    return Evaluation(
-        expectation(belief, solution.values),
-        expectation(belief, solution.lower),
-        expectation(belief, solution.upper),
-        reduction.partition.blocks,
-        solution.guarantee,
-    )
-
-
-def evaluate_structured(solution: StructuredSolution) -> Evaluation:
-    """The value at the initial belief of what was solved on diagrams."""
-    return Evaluation(solution.value, solution.lower, solution.upper, None, solution.guarantee)
-
-
-def describe_block(reduction: Reduction, block: int) -> str:
-    """A block by its first state."""
-    partition = reduction.partition
-    return partition.symbolic.state_text(partition.representatives[block].tolist())
 
 
 def refuse_unavoidable_dead_ends(root: AnySolvedTask) -> None:

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from factored_polca.approximation.snap import Snapped, snap
 from factored_polca.diagrams import INDEX, Diagram, choose, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.alpha_vectors import AlphaVectors
@@ -95,6 +96,17 @@ class ExecutablePomdpPlan(DrawnGraph, Framed):
         channels = planning_channels(self.model, task)
         return subtask_process(self.symbolic, task, children, reachable, channels)
 
+    @property
+    def snapped(self) -> Snapped:
+        """The model whose near rows are one, which a plan with `merge_within` was made with.
+
+        Raises:
+            ModelError: the report's number is no distance.
+        """
+        if "snapped" not in self.known:
+            self.known["snapped"] = snap(self.symbolic, self.report["merge_within"])
+        return self.known["snapped"]  # type: ignore[no-any-return]
+
     def quotient(self, name: str) -> PomdpQuotient:
         """The POMDP over blocks that task `name` was solved for; made when it is first asked for.
 
@@ -103,10 +115,10 @@ class ExecutablePomdpPlan(DrawnGraph, Framed):
         """
         key = f"quotient {name}"
         if key not in self.known:
-            partition = self.policies[name].partition
-            self.known[key] = make_pomdp_quotient(
-                self.process(name), partition, maximum_observations=OBSERVATIONS
-            )
+            partition, process = self.policies[name].partition, self.process(name)
+            if self.report.get("merge_within"):
+                process = self.snapped.process(process)
+            self.known[key] = make_pomdp_quotient(process, partition, maximum_observations=OBSERVATIONS)
         return self.known[key]  # type: ignore[no-any-return]
 
     def values(self, name: str) -> AlphaVectors:

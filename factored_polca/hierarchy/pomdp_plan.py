@@ -28,6 +28,7 @@ from typing import Final
 
 import numpy as np
 
+from factored_polca.approximation.approximate import certify_pomdp
 from factored_polca.diagrams import Diagram
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import (
@@ -37,6 +38,7 @@ from factored_polca.hierarchy.check import (
     planning_order,
     pomdp_solver_of,
 )
+from factored_polca.hierarchy.merging import CertifiedBounds, limits_named, merging_for
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_solved import (
     BeliefPolicy,
@@ -73,7 +75,10 @@ class FlatBound:
 
 @dataclass(frozen=True)
 class PomdpPlan(DrawnGraph, Framed):
-    """A hierarchy solved under partial observability; `solved` lists the tasks children first."""
+    """A hierarchy solved under partial observability; `solved` lists the tasks children first.
+
+    Where near states were merged, `certified` bounds the optimum without an exact quotient.
+    """
 
     symbolic: SymbolicModel
     tasks: TaskHierarchy
@@ -81,6 +86,7 @@ class PomdpPlan(DrawnGraph, Framed):
     flat: FlatBound
     seconds: float
     warnings: tuple[str, ...] = field(default=())
+    certified: CertifiedBounds | None = None
 
     def __repr__(self) -> str:
         return f"<PomdpPlan of {self.model.name}: {len(self.solved)} tasks>"
@@ -137,10 +143,11 @@ def plan_pomdp(
     planner = _Planner(symbolic, hierarchy, options, progress)
     for task in planning_order(hierarchy):
         planner.solve(task)
-    flat = planner.flat()
+    flat, certified = planner.flat(), planner.certified()
     solved = tuple(planner.solved.values())
     warnings = tuple(w for one in solved for w in one.warnings)
-    return PomdpPlan(symbolic, hierarchy, solved, flat, time.perf_counter() - began, warnings)
+    seconds = time.perf_counter() - began
+    return PomdpPlan(symbolic, hierarchy, solved, flat, seconds, warnings, certified)
 
 
 def refuse_unplannable(model: Model) -> None:
@@ -178,6 +185,7 @@ class _Planner:
         self.options, self.progress = options, progress
         self.solved: dict[str, SolvedPomdpTask] = {}
         self.custom = custom_solver(options.solver)
+        self.merging = merging_for(symbolic, options)
         self.reachable: Diagram | None = None
         if options.reachable:
             from factored_polca.symbolic.reach import reachable_states
@@ -202,6 +210,19 @@ class _Planner:
         except LimitReached as error:
             raise LimitReached(f"task {name!r}: {error}", error.stage, error.partial) from None
 
+    def merged(self, name: str, process: DecisionProcess) -> Reduction:
+        """A task's reduction: exact, or of a process near it."""
+        if self.merging is None:
+            return self.reduce(name, process, self.options.block_limit)
+        try:
+            return self.merging.reduce(
+                process,
+                self.options.block_limit,
+                lambda number, blocks: self.tell(name, "merge", number, blocks),
+            )
+        except LimitReached as error:
+            raise LimitReached(f"task {name!r}: {error}", error.stage, error.partial) from None
+
     def solve(self, task: Task) -> None:
         """Steps 1 to 4 of the module's docstring for one task."""
         began = time.perf_counter()
@@ -209,9 +230,10 @@ class _Planner:
         method = pomdp_solver_of(task, named_solver(self.options.solver))
         channels = planning_channels(self.symbolic.model, task)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable, channels)
-        reduction = self.reduce(task.name, process, self.options.block_limit)
+        reduction = self.merged(task.name, process)
         quotient = reduction.pomdp_quotient
-        refuse_without_purpose(task, quotient.mdp)
+        if self.merging is None or not self.merging.has_purpose(process):
+            refuse_without_purpose(task, quotient.mdp)
         minimised = time.perf_counter()
         is_root = task in self.hierarchy.roots()
         solution = self.optimise(task, reduction, method, is_root)
@@ -222,6 +244,7 @@ class _Planner:
             task, reduction, solution, policy, corner, reduction.lift_policy(corner),
             self.symbolic.manager.constant(1), ties, now - began, minimised - began,
             task_warnings(task, solution, is_child=not is_root),
+            None if self.merging is None else self.merging.certify_pomdp(reduction, solution),
         )  # fmt: skip
         self.tell(task.name, "done", 0, reduction.partition.blocks)
 
@@ -253,6 +276,27 @@ class _Planner:
                 solution,
             )
         return solution
+
+    def certified(self) -> CertifiedBounds | None:
+        """What no policy can exceed, by the merged flat process; the polled policy is measured."""
+        root = self.solved[planning_order(self.hierarchy)[-1].name]
+        if self.merging is None:
+            return None
+        process = flat_process(
+            self.symbolic, reachable=self.reachable, terminal=root.reduction.process.terminal
+        )
+        note = "what the polled policy earns is measured"
+        try:
+            reduction = self.merging.reduce(process, self.options.block_limit)
+            pomdp = reduction.pomdp_quotient.pomdp
+            found = solve_pomdp(pomdp, "fib", demand=Demand(deadline=self.options.deadline))
+            if found.status == "interrupted":
+                raise KeyboardInterrupt
+            with limits_named():
+                optimum = certify_pomdp(reduction, found).optimum
+        except LimitReached as error:
+            return CertifiedBounds(None, None, None, f"{note}; no bound on the optimum: {error}")
+        return CertifiedBounds(None, None, optimum, note, pomdp.states)
 
     def flat(self) -> FlatBound:
         """What no policy can exceed, or why it was left out."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from factored_polca.hierarchy.merging import approximation_report, merging_report, merging_text
 from factored_polca.hierarchy.parameters import mdp_parameters, pomdp_parameters, unreduced_parameters
 from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
@@ -38,6 +39,7 @@ def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) ->
         "flat_blocks": plan.flat.blocks,
         "flat_note": plan.flat.note,
         "guarantee": guarantee(plan),
+        **merging_report(plan.root.approximation, plan.certified),
         "tasks": tasks,
         "totals": {"parameters": {key: total(tasks, key) for key in ("none", "polca", "polca_plus")}},
         "warnings": list(plan.warnings),
@@ -84,6 +86,7 @@ def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
         "collision_bound": solved.reduction.minimisation.collision_bound,
         "minimise_seconds": solved.minimise_seconds,
         "seconds": solved.seconds,
+        **approximation_report(solved.approximation),
     }
 
 
@@ -98,6 +101,8 @@ def task_guarantee(solved: SolvedPomdpTask) -> str:
 def guarantee(plan: PomdpPlan) -> str:
     """How far the values may be trusted, in words."""
     chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
+    if plan.root.approximation is not None:
+        return merging_text(plan.root.approximation, plan.certified)
     return (
         "each task's bounds hold in its own model, given what its children do where they are certain; what "
         "the polled policy earns is measured; each partition exact but for a chance below "

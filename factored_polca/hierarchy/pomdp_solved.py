@@ -12,6 +12,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
+from factored_polca.approximation.approximate import Approximation
 from factored_polca.diagrams import Diagram
 from factored_polca.drawn import DrawnGraph
 from factored_polca.explicit.alpha_vectors import AlphaVectors
@@ -50,6 +51,7 @@ class SolvedPomdpTask(DrawnGraph):
     seconds: float
     minimise_seconds: float
     warnings: tuple[str, ...] = field(default=())
+    approximation: Approximation | None = None
 
     @property
     def lower(self) -> float:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from factored_polca.approximation.approximate import Approximation
+from factored_polca.hierarchy.irrelevance import KINDS, value_classes
+from factored_polca.hierarchy.merging import approximation_report, merging_report, merging_text
 from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
 from factored_polca.hierarchy.solved import AnySolvedTask, StructuredTask
+from factored_polca.minimisation.reduction import InterchangeableReduction
 
 
 def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
@@ -20,6 +24,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
         "flat_blocks": None if plan.flat is None else plan.flat.blocks,
         "flat_note": plan.flat_note,
         "guarantee": guarantee(plan),
+        **merging_report(approximation_of(plan.root), plan.certified),
         "tasks": [
             {
                 "name": solved.task.name,
@@ -29,6 +34,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "q_applicable": None if solved.counts is None else solved.counts.q_applicable,
                 "q_classes": None if solved.counts is None else solved.counts.q_classes,
                 "q_classes_shared": None if solved.counts is None else solved.counts.q_classes_shared,
+                "value_classes": classes_by_kind(solved),
                 "value": solved.value,
                 "solver": solved.method,
                 "gap": solved.gap,
@@ -38,6 +44,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "seconds": solved.seconds,
                 "nodes": solved.solution.nodes if isinstance(solved, StructuredTask) else None,
                 "note": solved.solution.note if isinstance(solved, StructuredTask) else "",
+                **approximation_report(approximation_of(solved)),
             }
             for solved in plan.solved
         ],
@@ -53,12 +60,27 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
     }
 
 
+def classes_by_kind(solved: AnySolvedTask) -> dict[str, int]:
+    """How many classes of equal Q-values, equal values and actions, equal actions a task's states have."""
+    if isinstance(solved, StructuredTask):
+        return {}
+    exchanged = isinstance(solved.reduction, InterchangeableReduction)
+    return {kind: value_classes(solved, kind).classes for kind in KINDS if not (exchanged and kind == "q")}
+
+
+def approximation_of(solved: AnySolvedTask) -> Approximation | None:
+    """What is certain where near states were merged; None where they were not."""
+    return None if isinstance(solved, StructuredTask) else solved.approximation
+
+
 def guarantee(plan: HierarchicalPlan) -> str:
     """How far the value may be trusted, in words."""
     width = plan.polled.upper - plan.polled.lower
     gap = max(solved.gap for solved in plan.solved)
     bounds = [collision_bound(solved) for solved in plan.solved]
     chance = sum(bound for bound in bounds if bound is not None)
+    if (approximation := approximation_of(plan.root)) is not None:
+        return merging_text(approximation, plan.certified)
     names = [solved.task.name for solved in plan.solved if isinstance(solved, StructuredTask)]
     partitions = f"each partition exact but for a chance below {max(chance, 1e-300):.1g}"
     if len(names) == len(plan.solved):

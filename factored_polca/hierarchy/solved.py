@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from factored_polca.approximation.approximate import Approximation
 from factored_polca.diagrams import Diagram
 from factored_polca.drawn import DrawnGraph
 from factored_polca.hierarchy.counts import QValueCounts
@@ -25,7 +26,8 @@ class SolvedTask(DrawnGraph):
     `policy` maps states to numbers of primitive actions; where it is not `defined` (the task has
     ended, or has no way to avoid a dead end) its leaf is the number of the model's actions.
     `value` is the optimum under the task's own reward at the initial belief; minus infinity where
-    a dead end can't be avoided from some start state.
+    a dead end can't be avoided from some start state.  Where near states were merged all of this is the
+    merged process's, and `approximation` says what is certain in the task itself.
     """
 
     task: Task
@@ -38,6 +40,7 @@ class SolvedTask(DrawnGraph):
     seconds: float
     dead_end_states: int = 0
     warnings: tuple[str, ...] = field(default=())
+    approximation: Approximation | None = None
 
     def __repr__(self) -> str:
         blocks = self.reduction.partition.blocks

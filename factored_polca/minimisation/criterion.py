@@ -8,10 +8,12 @@ rewards and transitions count only where app_c holds (Dean & Givan 1997; DESIGN 
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm, prod
+from typing import Protocol
 
 from factored_polca.diagrams import Diagram, choose, leaves
 from factored_polca.symbolic import NumericView, SymbolicModel, Term
@@ -40,6 +42,27 @@ class Choice:
         return self.policy.equals(manager.constant(primitive))
 
 
+class OpenNumbers(Protocol):
+    """What a minimisation has to know of a process whose numbers depend on parameters that stay symbols.
+
+    `degree` bounds the degree of the numbers, as polynomials with denominators cleared, in what is drawn;
+    `bits` is to them what `difference_bits` is to rationals, `denominator` what `common_denominator` is.
+    """
+
+    @property
+    def degree(self) -> int: ...
+
+    @property
+    def bits(self) -> int: ...
+
+    @property
+    def denominator(self) -> int: ...
+
+    def draw(self, source: random.Random, prime: int) -> DecisionProcess:
+        """The process at a random point, its numbers given by their residues."""
+        ...
+
+
 @dataclass(frozen=True)
 class DecisionProcess:
     """States of a symbolic model, choices, a terminal set, and the reward of each primitive action.
@@ -47,6 +70,7 @@ class DecisionProcess:
     `rewards[p]` are the terms that primitive p earns here; `reachable` restricts attention to a set
     of states that no choice leaves (None: all).  `channels` are the numbers of the observations that
     count, None where the state is seen (a partially observed process may have none: blind).
+    `open_numbers` are there where parameters stay symbols.
     """
 
     symbolic: SymbolicModel
@@ -55,6 +79,7 @@ class DecisionProcess:
     rewards: dict[int, tuple[Term, ...]]
     reachable: Diagram | None = None
     channels: tuple[int, ...] | None = None
+    open_numbers: OpenNumbers | None = None
 
     @property
     def partial(self) -> bool:
@@ -177,6 +202,8 @@ def largest_reward(process: DecisionProcess, primitive: int) -> Fraction:
 
 def common_denominator(process: DecisionProcess) -> int:
     """A multiple of every denominator of a probability or reward that the process uses."""
+    if process.open_numbers is not None:
+        return process.open_numbers.denominator
     primitives = {p for choice in process.choices for p in choice.primitives}
     used = [f(process, p) for p in sorted(primitives) for f in (row_denominator, reward_denominator)]
     return lcm(*used)

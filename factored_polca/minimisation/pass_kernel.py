@@ -9,14 +9,21 @@ so a pass regresses D, which is sparse, and splits by that (`factored_polca.mini
 Where nothing of a block is untouched the largest of its parts keeps its element, so that D holds the
 smaller ones (Hopcroft 1971; Paige & Tarjan 1987).
 
-For each choice c, with masks m_cp, the 0/1 diagrams of where c applies and stands for primitive p,
+For each choice c, with masks m_cp, the 0/1 diagrams of where c applies and stands for primitive p, and
+with a random factor s_c,
 
-    f_c = sum over p of m_cp R_p[D];     split by f_c.
+    f_c = sum over p of m_cp R_p[D];     split by sum over c of s_c f_c.
 
-Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them.
+The sum is one random linear form of all rows of a state: where some f_c differ it agrees with a chance of
+1/p over s (Schwartz 1980), and one split does for all choices.
 
-    progress  [choice, stage, place in the choice's list of primitives; in stage 3 the node of f_c]
-    counts    [nodes of D]
+Primitive p is the row p of `first_weights`, `last_changed` and `keys`, as `run_regression` takes them, or,
+where `width[p]` is not 0, the row p of those that `run_descent` takes.
+
+    progress    [choice, stage, place in the choice's list of primitives; in stage 4 what to split by]
+    counts      [nodes of D]
+    signatures  f_c [choice], of the choices done in this pass
+    factors     the leaf s_c [choice]
 """
 
 from __future__ import annotations
@@ -24,12 +31,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from factored_polca.diagrams.descent import FOUND, FRAMES, HEADER, SUMMING, run_descent
 from factored_polca.diagrams.jit import int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, Int32Array, Int64Array
 from factored_polca.diagrams.weighted import (
     NORMALISED,
     ONE,
     ZERO,
+    begin_sum,
     collect_possible,
     run_regression,
     run_weighted_sum,
@@ -68,7 +77,11 @@ def run_passes(
     nodes: Int32Array, images: Int32Array, new_blocks: Int32Array, exact: UInt64Array,
     changes: UInt64Array, rough: npt.NDArray[np.float64], changed: Int32Array, counts: Int64Array,
     sum_state: Int64Array, walked: Int64Array, state: Int64Array, work: Int64Array,
-    progress: Int64Array, collect_at: int, passes: int,
+    progress: Int64Array, width: Int64Array, carried: npt.NDArray[np.int64],
+    row_roots: npt.NDArray[np.int32], row_identity: npt.NDArray[np.int32],
+    row_fixed: npt.NDArray[np.int32], row_base: npt.NDArray[np.int64], row_last: Int64Array,
+    entry_first: Int64Array, entry_value: Int32Array, entry_weight: Int32Array, entry_weights: Int32Array,
+    frames: Int32Array, found: Int32Array, down: Int64Array, signatures: Int32Array, factors: Int32Array, collect_at: int, passes: int,
 ) -> int:  # fmt: skip
     """Passes over all choices until D is 0, or `passes` are done (counted in `numbers`).
 
@@ -96,6 +109,27 @@ def run_passes(
                         value = int64(live[DIFFERENCE])
                         if last_changed[p] < 0 or pool[value] == leaf_level:
                             regressed[p] = value
+                        elif width[p] >= 0:
+                            if down[FRAMES] == 0:
+                                frames[0] = 0
+                                frames[1] = 0
+                                frames[2] = -1
+                                frames[HEADER] = value
+                                for j in range(width[p]):
+                                    frames[HEADER + 1 + j] = row_roots[p, j]
+                                down[FRAMES] = 1
+                                down[FOUND] = 0
+                                down[SUMMING] = 0
+                            code = run_descent(
+                                pool, head, unique, arity, slots, ring, ring_state, sums, field, stack,
+                                terms, results, sum_state, keys[p], width[p], carried[p],
+                                row_identity[p], row_fixed[p], row_base[p], row_last[p], entry_first,
+                                entry_value, entry_weight, entry_weights, frames, found, down,
+                            )  # fmt: skip
+                            if code != DONE:
+                                return code
+                            regressed[p] = found[0]
+                            down[FRAMES] = 0
                         else:
                             if walked[0] == 0 and walked[1] == 0:
                                 if len(changed) <= head[1]:
@@ -126,22 +160,14 @@ def run_passes(
                         terms[2 * count] = choice_mask[j]
                         terms[2 * count + 1] = part
                         count += 1
+                begin_sum(stack, sum_state, count, plain[NORMALISED])
+                progress[STEP] = 2
                 if count == 0:
-                    progress[CHOICE] += 1
-                    progress[STEP] = 0
-                    continue
-                if count == 1 and terms[0] == plain[ONE]:
-                    progress[PLACE] = terms[1]
+                    signatures[c] = zero
                     progress[STEP] = 3
-                else:
-                    stack[0] = 0
-                    stack[1] = count
-                    stack[2] = -1
-                    stack[3] = 0
-                    stack[4] = plain[NORMALISED]
-                    sum_state[0] = 1
-                    sum_state[1] = 0
-                    progress[STEP] = 2
+                elif count == 1 and terms[0] == plain[ONE]:
+                    signatures[c] = terms[1]
+                    progress[STEP] = 3
             if progress[STEP] == 2:
                 code = run_weighted_sum(
                     pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
@@ -151,25 +177,48 @@ def run_passes(
                     return code
                 head[2] += STEPS - sum_state[2]
                 sum_state[2] = STEPS
-                progress[PLACE] = results[0]
+                signatures[c] = results[0]
+            progress[CHOICE] += 1
+            progress[STEP] = 0
+            if progress[CHOICE] == choices:
+                count = int64(0)
+                for j in range(choices):
+                    if signatures[j] != zero:
+                        terms[2 * count] = factors[j]
+                        terms[2 * count + 1] = signatures[j]
+                        count += 1
+                begin_sum(stack, sum_state, count, plain[NORMALISED])
                 progress[STEP] = 3
-            code = run_split(
-                pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
-                field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
-                nodes, images, new_blocks, exact, changes, rough, state, work,
+                if count < 2:
+                    progress[PLACE] = terms[1] if count == 1 else zero
+                    progress[STEP] = 4
+        if progress[STEP] == 3:
+            code = run_weighted_sum(
+                pool, head, unique, arity, slots, ring, ring_state, plain, field, stack, terms,
+                results, sum_state,
             )  # fmt: skip
             if code != DONE:
                 return code
-            progress[CHOICE] += 1
-            progress[STEP] = 0
-            if numbers[BLOCKS] > numbers[ALLOWED]:
-                return BEYOND
+            head[2] += STEPS - sum_state[2]
+            sum_state[2] = STEPS
+            progress[PLACE] = results[0]
+            progress[STEP] = 4
+        code = run_split(
+            pool, head, unique, arity, cache, stack, results, words, progress[PLACE], operators,
+            field, one, inverses, live, numbers, elements, block_shares, touched, largest, fresh,
+            nodes, images, new_blocks, exact, changes, rough, state, work,
+        )  # fmt: skip
+        if code != DONE:
+            return code
         live[DIFFERENCE] = live[NEXT]
         live[NEXT] = zero
         for p in range(len(regressed)):
             regressed[p] = 0
         progress[CHOICE] = 0
+        progress[STEP] = 0
         numbers[PASSES] += 1
+        if numbers[BLOCKS] > numbers[ALLOWED]:
+            return BEYOND
         if head[2] - numbers[LOOKED] > STEPS // 8:
             numbers[LOOKED] = head[2]
             return PAUSE

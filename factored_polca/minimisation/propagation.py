@@ -37,6 +37,7 @@ from factored_polca.minimisation.split_kernel import (
     USED,
     shares,
 )
+from factored_polca.symbolic.descent import Cuts, Descents
 from factored_polca.symbolic.regression import Prepared
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -62,6 +63,7 @@ class Propagation:
         allowed: stop beyond so many blocks.
         look: called now and then with the passes so far and the blocks.
         race: tells how to regress all of V, in the first pass.
+        cuts: keeps the cuts of rows from one field to the next.
     """
 
     def __init__(
@@ -74,11 +76,13 @@ class Propagation:
         allowed: int | None = None,
         look: Callable[[int, int], None] | None = None,
         race: Race | None = None,
+        cuts: Cuts | None = None,
     ) -> None:
         field = view.numbers.leaf_type
         assert isinstance(field, Field)
         self.view, self.field, self.draw, self.look = view, field, draw, look
         self.manager, self.race = view.numbers.manager, race
+        self.cuts: Cuts = {} if cuts is None else cuts
         self.zero, self.one = view.numbers.zero, view.numbers.one
         self.choices: Sequence[Choice] = view.process.choices
         self.numbers = np.array([len(elements), 0, 0, allowed or UNLIMITED, 0], dtype=np.int64)
@@ -94,6 +98,11 @@ class Propagation:
         inverses = [field.encode(pow(size, -1, field.prime)) for size in sizes]
         self.inverses = np.array([*inverses, field.encode(1)], dtype=np.uint64)
         self.unit = np.uint64(field.encode(1))
+        self.factors = [
+            self.manager.stored_constant(f, self.field) for f in draw(len(self.choices)).tolist()
+        ]
+        self.signatures = np.zeros(len(self.choices), dtype=np.int32)
+        self.signature_handles: list[Diagram] = []
         self._list_choices()
         self._prepare_primitives()
         self._size_arrays(elements)
@@ -125,17 +134,22 @@ class Propagation:
         self.last_changed = np.full(len(self.primitives), -1, dtype=np.int64)
         self.keys = np.zeros(len(self.primitives), dtype=np.int64)
         self.weights: list[Diagram] = []
-        self.others: list[int] = []
-        for number, primitive in enumerate(self.primitives):
-            compiled = numbers.symbolic.actions[primitive]
-            if sensed is not None or compiled.synchronic:
-                self.others.append(number)
-            elif compiled.rows:
-                prepared: Prepared = numbers.prepared(primitive)
-                self.first_weights[number] = prepared.first + len(self.weights)
-                self.last_changed[number] = prepared.last_changed
-                self.keys[number] = prepared.key
-                self.weights += prepared.handles
+        actions = [numbers.symbolic.actions[primitive] for primitive in self.primitives]
+        self.others = [n for n, a in enumerate(actions) if sensed is not None or a.synchronic]
+        inside = [-1 if n in self.others else primitive for n, primitive in enumerate(self.primitives)]
+        self.descents = Descents(numbers, inside, self.cuts)
+        for number, (primitive, compiled) in enumerate(zip(self.primitives, actions, strict=True)):
+            if number in self.others or not compiled.rows:
+                continue
+            if self.descents.few[number]:
+                self.last_changed[number] = max(map(numbers.symbolic.now, compiled.rows))
+                self.keys[number] = numbers.regression_key(primitive)
+                continue
+            prepared: Prepared = numbers.prepared(primitive)
+            self.first_weights[number] = prepared.first + len(self.weights)
+            self.last_changed[number] = prepared.last_changed
+            self.keys[number] = prepared.key
+            self.weights += prepared.handles
         self.regressed = np.zeros(len(self.primitives), dtype=np.int32)
         self.regressed_handles: dict[int, Diagram] = {}
 
@@ -149,7 +163,7 @@ class Propagation:
         self.largest = np.zeros(blocks, dtype=np.int32)
         self.fresh = self.draw(1024)
         levels, manager = self.manager.leaf_level + 3, self.manager
-        widest = max((*manager.sizes, 2, int(np.diff(self.choice_first).max(initial=1))))
+        widest = max((*manager.sizes, 2, int(np.diff(self.choice_first).max(initial=1)), len(self.choices)))
         self.terms = np.zeros(2 * widest * levels + 2, dtype=np.int32)
         self._size_node_arrays()
 
@@ -195,6 +209,10 @@ class Propagation:
         self.live[:] = [handle.node for handle in self.handles]
         self.weight_nodes = np.array([0, *(w.node for w in self.weights)], dtype=np.int32)[1:]
         self.mask_nodes = np.array([mask.node for mask in self.masks], dtype=np.int32)
+        self.factor_nodes = np.array([factor.node for factor in self.factors], dtype=np.int32)
+        self.descents.refresh()
+        for number, handle in enumerate(self.signature_handles):
+            self.signatures[number] = handle.node
         for number, handle in self.regressed_handles.items():
             self.regressed[number] = handle.node
         self.collections = manager.collections
@@ -211,6 +229,9 @@ class Propagation:
             int(number): manager.handle(int(self.regressed[number]), self.field)
             for number in np.flatnonzero(self.regressed)
         }
+        self.signature_handles = [
+            manager.handle(int(node), self.field) for node in self.signatures[: self.progress[0]]
+        ]
 
     def _measure(self, labels: Diagram) -> None:
         """The share of each block."""
@@ -294,11 +315,12 @@ class Propagation:
             return []
         if node_count(self.handles[DIFFERENCE]) < LARGE:
             return []
-        return [n for n in range(len(self.primitives)) if self.last_changed[n] >= 0]
+        few = self.descents.few
+        return [n for n in range(len(self.primitives)) if self.last_changed[n] >= 0 and not few[n]]
 
     def _run_until(self, end: int) -> None:
         """The kernel, until `end` passes are done or nothing changes any more."""
-        m = self.manager
+        m, d = self.manager, self.descents
         while True:
             code = run_passes(
                 m.pool, m.head, m.unique, m.arity, m.cache, m.slots, m.ring, m.ring_state, m.stack,
@@ -308,7 +330,9 @@ class Propagation:
                 self.regressed, self.live, self.numbers, self.elements, self.block_shares, self.touched,
                 self.largest, self.fresh, self.nodes, self.images, self.new_blocks, self.exact,
                 self.changes, self.rough, self.changed, self.counts, self.sum_state, self.walked,
-                self.state, self.work, self.progress, m.collect_at, end,
+                self.state, self.work, self.progress, d.width, d.carried, d.roots, d.identity, d.fixed,
+                d.base, d.last, d.first, d.value, d.weight, d.weight_nodes, d.frames, d.found, d.down,
+                self.signatures, self.factor_nodes, m.collect_at, end,
             )  # fmt: skip
             if code == DONE:
                 return

@@ -178,6 +178,10 @@ def _plain_plan(symbolic: SymbolicModel, diagram: Diagram) -> PushPlan:
     )  # fmt: skip
 
 
+ExactRow = tuple[tuple[int, Fraction], ...]
+"""The values of a feature that have a positive probability, with it."""
+
+
 @dataclass(frozen=True)
 class RowTable:
     """Rows of many features as flat lists of (value, probability), positive entries only."""
@@ -185,13 +189,19 @@ class RowTable:
     start: Int64Array  # [row]
     value: Int32Array
     probability: FloatArray
-    exact: tuple[tuple[tuple[int, Fraction], ...], ...]
+    exact: tuple[ExactRow, ...]
     offset: dict[int, int]  # feature -> number of its first row; persisting features: rows by value
 
 
-def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTable:
-    """All rows of an action: of its row diagrams, and unit rows for features that persist."""
-    exact: list[tuple[tuple[int, Fraction], ...]] = []
+def exact_rows(
+    symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]
+) -> tuple[tuple[ExactRow, ...], dict[int, int]]:
+    """All rows of an action: of its row diagrams, and unit rows for features that persist.
+
+    Returns:
+        the rows; feature -> the number of its first one.
+    """
+    exact: list[ExactRow] = []
     offset: dict[int, int] = {}
     for feature, definition in enumerate(symbolic.model.features):
         offset[feature] = len(exact)
@@ -199,10 +209,16 @@ def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTab
             exact += [tuple((v, q) for v, q in enumerate(row) if q) for row in rows[feature].rows]
         else:
             exact += [((v, Fraction(1)),) for v in range(len(definition.values))]
+    return tuple(exact), offset
+
+
+def row_table(symbolic: SymbolicModel, rows: Mapping[int, RowDiagram]) -> RowTable:
+    """All rows of an action, as `exact_rows` lists them."""
+    exact, offset = exact_rows(symbolic, rows)
     start = np.concatenate([[0], np.cumsum([len(row) for row in exact])]).astype(np.int64)
     value = np.array([v for row in exact for v, _ in row], dtype=np.int32)
     probability = np.array([float(q) for row in exact for _, q in row], dtype=np.float64)
-    return RowTable(start, value, probability, tuple(exact), offset)
+    return RowTable(start, value, probability, exact, offset)
 
 
 def rows_at(
@@ -253,7 +269,8 @@ def push_floats(
         if leaf[q] > largest:
             largest = leaf[q]
     total = np.zeros(largest + 1, np.float64)
-    touched = np.empty(largest + 1, np.int64)
+    touched = np.empty(largest + 1, np.int32)
+    leaves = np.empty(largest + 2, np.int32)
     pause_at = state[1] + PAIRS
     while state[0] < len(chosen):
         if state[1] >= pause_at:
@@ -291,11 +308,14 @@ def push_floats(
             for j in range(ends):
                 total[touched[j]] = 0.0
             return 1
-        ordered = np.sort(touched[:ends])
         for j in range(ends):
-            blocks[state[1] + j] = ordered[j]
-            masses[state[1] + j] = total[ordered[j]]
-            total[ordered[j]] = 0.0
+            size = _heap_push(leaves, size, touched[j])
+        for j in range(ends):
+            k = leaves[0]
+            size = _heap_pop(leaves, size)
+            blocks[state[1] + j] = k
+            masses[state[1] + j] = total[k]
+            total[k] = 0.0
         state[1] += ends
         row_ends[row] = state[1]
         state[0] += 1

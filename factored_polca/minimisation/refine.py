@@ -3,10 +3,10 @@
 Letters: P partition (state -> block), r_k random field element of block k, V = r o P, f_c = R_c[V]
 regression through choice c, masked.
 
-    0. P_0 separates states by terminal flag, applicable choices and rewards.
+    0. P_0 separates states by terminal flag, applicable choices and a random linear form of the rewards.
     1. one pass: for each choice c, V = r o P, f_c = R_c[V]; P becomes the distinct pairs (P, f_c).
     2. a pass without a split ends the refinement;
-    3. a confirming pass repeats 0 and 1 with fresh draws and another, random, prime; a split there
+    3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a split there
        sends the refinement on with that prime.
 
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
@@ -21,7 +21,7 @@ the cleared numerator of their difference has B bits, at most B/60 of the 2.7 * 
 states in one block with different rows, rewards or masks that is fixed before the confirming draws,
 and passes with probability at most
 
-    B/60 / 2.7 * 10^16 + (2 + J) / 2^60,   J observation channels,
+    B/60 / 2.7 * 10^16 + (3 + J) / 2^60,   J observation channels,
 
 which is reported, raised to the number of confirming rounds that passed in a row, times the number of
 rounds that might have been the last.
@@ -58,6 +58,7 @@ from factored_polca.diagrams import (
     pairs,
     random_prime,
     relabel,
+    weighted_sum,
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.drawn import Drawn, Framed
@@ -75,6 +76,7 @@ from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagatio
 from factored_polca.minimisation.race import Race
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
+from factored_polca.symbolic.descent import Cuts
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
 
 PRIMES_IN_RANGE = 2.7e16
@@ -187,6 +189,7 @@ class _Refinement:
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | None = None
         self.race = Race()
+        self.cuts: Cuts = {}
         self.denominator = common_denominator(process)
         self.use(Field() if self.denominator % MERSENNE_61 else Field(self.fresh_prime()))
 
@@ -212,11 +215,15 @@ class _Refinement:
             self.polynomial = Polynomial(self.view, field, self.generator)
 
     def new_view(self, field: Field) -> ProcessView:
-        """The process in a field, with fresh draws for observations."""
-        numbers = NumericView(self.process.symbolic, field)
-        channels = self.process.channels
-        sensed = None if not channels else SensedRegression(numbers, channels, self.generator)
-        return ProcessView(self.process, numbers, sensed)
+        """The process in a field, with fresh draws for observations and for parameters kept as symbols."""
+        process = self.process
+        if process.open_numbers is not None:
+            process = process.open_numbers.draw(self.random, field.prime)
+        numbers = NumericView(process.symbolic, field)
+        sensed = (
+            None if not process.channels else SensedRegression(numbers, process.channels, self.generator)
+        )
+        return ProcessView(process, numbers, sensed)
 
     def run(self, confirmations: int) -> None:
         self.begin()
@@ -225,7 +232,7 @@ class _Refinement:
         while passed < confirmations:
             self.use(Field(self.fresh_prime()))
             before = self.labels.blocks
-            self.begin()
+            self.split_rewards()  # the rest of the beginning knows no numbers
             self.attempts += 1
             if self.one_pass() or self.labels.blocks > before:
                 passed = 0
@@ -255,13 +262,24 @@ class _Refinement:
             self.split(
                 diagram if reachable is None else choose(reachable, diagram, self.manager.constant(0))
             )
+        if not self.interchangeable:
+            for choice in self.process.choices:
+                self.split(self.view.app(choice))
+        self.split_rewards()
+
+    def split_rewards(self) -> None:
+        """Separate by rewards: by a random linear form of those of all choices, or by their multiset."""
         if self.interchangeable:
             self.split(self.polynomial.of_rewards())
             return
-        for choice in self.process.choices:
-            self.split(self.view.app(choice))
-        for choice in self.process.choices:
-            self.split(self.view.reward(choice))
+        rewards = [self.view.reward(choice) for choice in self.process.choices]
+        distinct = list(
+            {reward.node: reward for reward in rewards if reward != self.view.numbers.zero}.values()
+        )
+        factors = self.field.draw(self.generator, len(distinct))
+        if distinct:
+            weights = [self.manager.stored_constant(factor, self.field) for factor in factors.tolist()]
+            self.split(weighted_sum(weights, distinct))
 
     def split_seen(self) -> None:
         """Separate by the observed features: what is seen at every step, the end included."""
@@ -331,6 +349,7 @@ class _Refinement:
             lambda count: self.field.draw(self.generator, count),
             allowed=None if self.block_limit is None else self.block_limit + outside,
             look=lambda passes, blocks: self.report(self.rounds + passes, blocks), race=self.race,
+            cuts=self.cuts,
         )  # fmt: skip
 
     def keep(self, propagation: Propagation) -> None:
@@ -398,8 +417,12 @@ class _Refinement:
 
     def bound(self) -> float:
         """The probability that one confirming round lets a wrong partition pass."""
-        degree = 2 + len(self.process.channels or ())
-        bits = difference_bits(self.process)
+        degree = 3 + len(self.process.channels or ())
+        open_numbers = self.process.open_numbers
+        if open_numbers is None:
+            bits = difference_bits(self.process)
+        else:
+            degree, bits = degree + open_numbers.degree, open_numbers.bits
         if self.interchangeable:  # a product over the choices
             degree, bits = degree * len(self.process.choices), bits * len(self.process.choices)
         return bits / 60 / PRIMES_IN_RANGE + degree / 2**60

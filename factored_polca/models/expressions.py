@@ -25,6 +25,7 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any, Final
 
+from factored_polca.models.rational_functions import RationalFunction
 from factored_polca.models.scalars import OPERATORS, Scalar, Undefined, Value, apply_operator
 
 
@@ -275,6 +276,8 @@ def as_expression(thing: ExpressionLike) -> Expression:
     if isinstance(thing, Expression):
         return thing
     if isinstance(thing, bool):
+        return Constant(thing)
+    if isinstance(thing, RationalFunction):
         return Constant(thing)
     if isinstance(thing, numbers.Rational):
         return Constant(Fraction(int(thing.numerator), int(thing.denominator)))

@@ -1,6 +1,8 @@
 """Values of expressions, and the operators on them: a table, with a row for each operator.
 
 A value is a rational, a truth value or a name; what has no value is `Undefined`, with a reason.
+Where parameters stay symbols numbers may be rational functions of them, and the operators of the field,
+`FIELD`, are the only ones that take these.
 """
 
 from __future__ import annotations
@@ -9,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Final, Union
+
+from factored_polca.models.rational_functions import RationalFunction
 
 Value = Union[bool, int, str]
 """A value of a feature."""
@@ -48,12 +52,17 @@ def describe(value: Scalar | Undefined) -> str:
         return f"undefined ({value.reason})"
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, RationalFunction):
+        text = str(value)
+        return text if len(text) <= 200 else f"a function of {', '.join(value.parameters)}"
     if isinstance(value, Fraction) and max(abs(value.numerator), value.denominator) >= 10**40:
         return "a number of more than 40 digits"
     return str(value)
 
 
 def _number(value: Fraction) -> Fraction | Undefined:
+    if isinstance(value, RationalFunction):  # which has limits of its own
+        return value
     if max(value.numerator.bit_length(), value.denominator.bit_length()) > MAXIMUM_BITS:
         return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
     return value
@@ -70,6 +79,8 @@ def _multiply(a: Fraction, b: Fraction) -> Fraction | Undefined:
 def _divide(a: Fraction, b: Fraction) -> Fraction | Undefined:
     if b == 0:
         return Undefined("division by zero")
+    if isinstance(b, RationalFunction):
+        b.field.divided_by(b)
     return _number(a / b)
 
 
@@ -86,10 +97,16 @@ def _modulo(a: Fraction, b: Fraction) -> Fraction | Undefined:
 
 
 def _power(a: Fraction, b: Fraction) -> Fraction | Undefined:
+    if isinstance(b, RationalFunction):
+        return Undefined(f"the exponent {describe(b)} depends on a parameter that stays a symbol")
     if b.denominator != 1 or abs(b.numerator) > MAXIMUM_EXPONENT:
         return Undefined(f"an exponent must be an integer of at most {MAXIMUM_EXPONENT}")
     if a == 0 and b < 0:
         return Undefined("division by zero")
+    if isinstance(a, RationalFunction):
+        if b < 0:
+            a.field.divided_by(a)
+        return a ** int(b)  # type: ignore[no-any-return]
     bits = max(a.numerator.bit_length(), a.denominator.bit_length())
     if bits * abs(b.numerator) > MAXIMUM_BITS:
         return Undefined(f"a number of more than {MAXIMUM_BITS} bits")
@@ -139,6 +156,10 @@ OPERATORS: Final[Mapping[str, Operator]] = {
 }
 
 
+FIELD: Final = frozenset({"add", "multiply", "divide", "power", "negate"})
+"""The operators of a field."""
+
+
 def _kind(value: Scalar) -> str:
     if isinstance(value, bool):
         return "a truth value"
@@ -172,6 +193,14 @@ def apply_operator(name: str, values: Iterable[Scalar | Undefined]) -> Scalar | 
         if isinstance(value, Undefined):
             return value
         arguments.append(value)
+    if name not in FIELD:
+        for value in arguments:
+            if isinstance(value, RationalFunction):
+                names = ", ".join(value.parameters)
+                return Undefined(
+                    f"'{row.symbol}' of {describe(value)}, which depends on {names}: a parameter that "
+                    "stays a symbol may stand in + - * / and integer powers only"
+                )
     if row.kind == "equality":
         a, b = arguments
         if type(a) is not type(b):

@@ -28,13 +28,16 @@ from factored_polca.solvers.value_iteration import Iterate, value_iteration
 SWITCH_MARGIN = 1e-12
 
 
-def policy_iteration(pairs: Pairs, stop: StopRule) -> Iterate:
+def policy_iteration(pairs: Pairs, stop: StopRule, start: IntArray | None = None) -> Iterate:
     """Policy iteration until no action is beaten, then bounds.
+
+    `start` [node] gives the pairs to begin with, such as those of a similar problem; at discount 1 they
+    must make a proper policy.
 
     Never raises for a limit: `status` tells which stopped it, the bounds hold all the same.
     """
     values = np.zeros(pairs.nodes)
-    policy = first_policy(pairs)
+    policy = first_policy(pairs) if start is None else start.copy()
     steps = 0
     status: Status | None = None
     try:

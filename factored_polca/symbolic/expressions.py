@@ -31,6 +31,7 @@ from factored_polca.models.expressions import (
 )
 from factored_polca.models.features import Feature, position
 from factored_polca.models.model import Observation
+from factored_polca.models.rational_functions import RationalFunction
 from factored_polca.models.scalars import Scalar, Undefined, apply_operator, describe, scalar
 
 
@@ -229,7 +230,7 @@ def _distribution(values: Sequence[Any]) -> TableValue:
         if not isinstance(chance, Fraction):
             shown = "a distribution" if isinstance(chance, Distribution) else describe(chance)
             return Undefined(f"a probability must be a number, not {shown}")
-        if chance < 0:
+        if not isinstance(chance, RationalFunction) and chance < 0:  # else a condition on parameters
             return Undefined(f"a probability is {describe(chance)}")
         total += chance
         if chance == 0:

@@ -20,6 +20,7 @@ import numpy as np
 from factored_polca.diagrams import INDEX, Diagram, choose, cofactors, combine, relabel, support
 from factored_polca.models.errors import Fault
 from factored_polca.models.expressions import Expression, Reference, references, rewrite
+from factored_polca.models.rational_functions import RationalFunction
 from factored_polca.symbolic.rows import RowDiagram, Term, as_number, numbered
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def _conditioned(build: _Build, rows: dict[int, RowDiagram]) -> dict[int, RowDia
     for number, factor in enumerate(model.initial.factors):
         compiled = build.compiler.compile(primed(factor))
         table = build.compiler.table.values
-        bad = np.array([not isinstance(v, (Fraction, bool)) or v < 0 for v in table], dtype=np.uint64)
+        bad = np.array([not _counts(v) for v in table], dtype=np.uint64)
         counts = np.array([value != 0 for value in product.values], dtype=np.uint64)
         wrong = relabel(compiled, bad, INDEX) & relabel(product.diagram, counts, INDEX)
         if wrong != build.false:
@@ -107,6 +108,13 @@ def _conditioned(build: _Build, rows: dict[int, RowDiagram]) -> dict[int, RowDia
         parents = tuple(j for j in order[:place] if 2 * build.positions[j] + 1 in support(diagram))
         result[index] = RowDiagram(index, diagram, tuple(found), parents)
     return result
+
+
+def _counts(value: object) -> bool:
+    """Whether a factor may have this value; what parameters that stay symbols make of it is seen later."""
+    if isinstance(value, RationalFunction):
+        return True
+    return isinstance(value, (Fraction, bool)) and value >= 0
 
 
 def _likelihood(build: _Build, row: RowDiagram) -> Term:

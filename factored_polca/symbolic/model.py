@@ -15,7 +15,7 @@ undefined entries are replaced by harmless ones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -78,7 +78,8 @@ class SymbolicModel:
     """A model compiled to diagrams of one manager; make it with `compile_model`.
 
     `initial` holds b0 as row diagrams over next variables: a feature's parents are other features
-    of the same, first, time slice.
+    of the same, first, time slice.  Models over one manager whose actions differ need a `variant` number
+    each: what the manager remembers of regressions it remembers by action and variant.
     """
 
     model: Model
@@ -90,6 +91,7 @@ class SymbolicModel:
     initial: dict[int, RowDiagram]
     warnings: tuple[Fault, ...] = ()
     positions: tuple[int, ...] = field(default=())  # [feature] -> position in the order
+    variant: int = 0
 
     def __repr__(self) -> str:
         return f"<SymbolicModel {self.model.name}: order {', '.join(self.order)}>"
@@ -142,6 +144,7 @@ def compile_model(
     tasks: TaskHierarchy | None = None,
     memory_limit: int | None = None,
     deadline: float | None = None,
+    parameters: Mapping[str, Fraction] | None = None,
 ) -> SymbolicModel:
     """Compile `model`, checking its structure and its probabilities.
 
@@ -151,6 +154,7 @@ def compile_model(
         tasks: a hierarchy whose conditions the order shall serve too.
         memory_limit: bytes for the diagrams.
         deadline: `time.monotonic()` value at which to stop.
+        parameters: values of parameters in place of the model's, symbols among them.
 
     Raises:
         ModelError: with every fault found.
@@ -178,7 +182,9 @@ def compile_model(
     }
     levels |= {Reference(o.name): 2 * len(names) + i for i, o in enumerate(model.observations)}
     variables: list[Variable] = [*model.features, *model.observations]
-    compiler = ExpressionCompiler(manager, variables, levels, dict(model.parameters))
+    compiler = ExpressionCompiler(
+        manager, variables, levels, {**dict(model.parameters), **(parameters or {})}
+    )
     return _Build(model, names, tuple(position), manager, compiler).finish()
 
 

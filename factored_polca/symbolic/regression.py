@@ -159,15 +159,18 @@ class NumericView:
             handles.extend(parts)
             if feature in self.symbolic.actions[action].rows:
                 last = max(last, self.symbolic.now(feature))
-        key = self.manager.cache_key("regression", name, self.leaf_type)
-        return Prepared(handles, first, last, key)
+        return Prepared(handles, first, last, self.regression_key(name))
+
+    def regression_key(self, name: Hashable) -> int:
+        """What tells remembered regressions with some weights from others."""
+        return self.manager.cache_key("regression", name, self.leaf_type)
 
     def prepared(self, action: int) -> Prepared:
         """The regression through an action without synchronic arcs."""
         if action not in self._prepared:
             features = range(len(self.symbolic.model.features))
             self._prepared[action] = self.prepare(
-                action, [self.weights(action, i) for i in features], action
+                action, [self.weights(action, i) for i in features], (action, self.symbolic.variant)
             )
         return self._prepared[action]
 

@@ -59,7 +59,8 @@ def possible(row: RowDiagram, level: int) -> Diagram:
     manager = row.diagram.manager
     result = manager.constant(0)
     for value in range(len(row.rows[0])):
-        positive = np.array([r[value] > 0 for r in row.rows], dtype=np.uint64)
+        # never negative; a function of parameters that stay symbols counts as possible
+        positive = np.array([bool(r[value]) for r in row.rows], dtype=np.uint64)
         here = relabel(row.diagram, positive, INDEX)
         result = choose(manager.indicator(level, [value]), here, result)
     return result

@@ -8,6 +8,10 @@ reordering is off.  Work is counted once for both: the nodes of the results of a
 without complement edges.  So the ratio of rates is the ratio of times, and CUDD's complement edges
 (free negation, up to half the nodes) count in its favour.  Only the calls are timed.
 
+Arithmetic has no peer here: CUDD's leaves are doubles.  So multiplying modulo 2^61 - 1 stands beside
+adding there, and beside both in doubles, on arguments of the same shape with random leaves, whose results
+have the same shape too.
+
 Compile seconds are the processor's in a fresh process with an empty `NUMBA_CACHE_DIR`, beside those
 of the same process started again; they are not part of the rates.
 """
@@ -27,6 +31,8 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
@@ -214,6 +220,71 @@ def measure(names: dict[str, Callable[[], Program]], pairs: int) -> Iterator[lis
         ]  # fmt: skip
 
 
+ARITHMETIC = (("field", "plus"), ("field", "times"), ("float", "plus"), ("float", "times"))
+"""Kinds of leaves, and operators."""
+
+
+def full_tree(manager: Any, levels: list[int], sizes: int, numbers: Iterator[int]) -> Any:
+    """An index diagram that tells all values of the variables at `levels` apart."""
+    if not levels:
+        return manager.constant(next(numbers))
+    children = [full_tree(manager, levels[1:], sizes, numbers) for _ in range(sizes)]
+    return manager.variable(levels[0], children)
+
+
+def counter(manager: Any, levels: list[int]) -> Any:
+    """The number of ones among the variables at `levels`: many states, few leaves."""
+    rows = [manager.constant(count) for count in range(len(levels) + 1)]
+    for place in range(len(levels) - 1, -1, -1):
+        rows = [manager.variable(levels[place], rows[count : count + 2]) for count in range(place + 1)]
+    return rows[0]
+
+
+def trees() -> tuple[Any, Any, Any]:
+    """Two trees of 729 leaves over alternating variables: most work is at the leaves."""
+    from factored_polca.diagrams import Manager
+
+    manager = Manager([3] * 12)
+    return manager, *(full_tree(manager, list(range(i, 12, 2)), 3, iter(range(729))) for i in (0, 1))
+
+
+def counters() -> tuple[Any, Any, Any]:
+    """Two counters over 240 alternating variables: most work is above the leaves."""
+    from factored_polca.diagrams import Manager
+
+    manager = Manager([2] * 240)
+    return manager, counter(manager, list(range(0, 240, 2))), counter(manager, list(range(1, 240, 2)))
+
+
+def arithmetic(
+    make: Callable[[], tuple[Any, Any, Any]], pairs: int
+) -> tuple[int, dict[tuple[str, str], float]]:
+    """Nodes of the result, and the median processor seconds of each kind and operator."""
+    from factored_polca.diagrams import FLOAT, Field, apply, leaves, node_count, relabel
+
+    seconds: dict[tuple[str, str], list[float]] = {row: [] for row in ARITHMETIC}
+    nodes: set[int] = set()
+    for number in range(pairs + 1):
+        for kind, name in ARITHMETIC:
+            manager, *indices = make()
+            draw = random.Random(number)
+            arguments = []
+            for index in indices:
+                values = [draw.randrange(1, 2**52) for _ in range(max(leaves(index)) + 1)]
+                leaf_type = Field() if kind == "field" else FLOAT
+                images = np.array(values, dtype=np.uint64 if kind == "field" else np.float64)
+                arguments.append(relabel(index, images, leaf_type))
+            start = time.process_time()
+            result = apply(name, *arguments)
+            if number:  # the first loads the kernels
+                seconds[kind, name].append(time.process_time() - start)
+            nodes.add(node_count(result))
+            del manager
+    smallest, largest = min(nodes), max(nodes)
+    assert largest <= 1.01 * smallest, "the results differ in shape"
+    return largest, {row: statistics.median(found) for row, found in seconds.items()}
+
+
 _FIRST_USE = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
@@ -283,6 +354,14 @@ def main() -> None:
     print(" | ".join(head))
     for row in measure(QUICK if options.quick else PROGRAMS, options.pairs):
         print(" | ".join(row), flush=True)
+    print("arithmetic, millions of nodes a second: | " + " | ".join(f"{k} {n}" for k, n in ARITHMETIC))
+    for label, make in (("two trees", trees), ("two counters", counters)):
+        nodes, seconds = arithmetic(make, options.pairs)
+        rates = " | ".join(f"{nodes / seconds[row] / 1e6:.2f}" for row in ARITHMETIC)
+        ratio = seconds["field", "times"] / seconds["field", "plus"]
+        print(
+            f"{label}, {nodes:,} nodes: | {rates} | field times / plus: {ratio:.2f} of the time", flush=True
+        )
     with tempfile.TemporaryDirectory() as cache:
         cold, warm = first_use(cache), first_use(cache)
     print("processor seconds in a fresh process: import | first apply | every other kernel")

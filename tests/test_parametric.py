@@ -1,0 +1,172 @@
+"""Models with parameters: one minimisation serves all settings, held against brute force at each.
+
+The other reading of each setting is the model with numbers in place of its parameters, enumerated state by
+state, its coarsest partition by signatures written out in full, its value by value iteration.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import cache
+
+import numpy as np
+import pytest
+from parametric_models import generic, parametric_mdp, parametric_pomdp, settings
+
+from factored_polca.explicit import minimiser
+from factored_polca.explicit.alpha_expansion import forward_values
+from factored_polca.explicit.dynamic_programming import action_values, lost_states
+from factored_polca.explicit.enumeration import enumerate_model
+from factored_polca.explicit.exact_mdp import ExactMDP
+from factored_polca.explicit.exact_pomdp import ExactPOMDP, enumerate_pomdp
+from factored_polca.models import Model
+from factored_polca.parametric import (
+    ParametricQuotient,
+    parametric_flat_process,
+    reduce_parametric,
+)
+from factored_polca.solvers.choose import solve_mdp
+
+MODELS = 30  # of each kind
+SETTINGS = 20
+
+
+@cache
+def reduced(kind: str, seed: int) -> tuple[Model, ParametricQuotient]:
+    model = (parametric_mdp if kind == "mdp" else parametric_pomdp)(seed)
+    return model, reduce_parametric(parametric_flat_process(model), seed=seed)
+
+
+def enumerated(model: Model, values: dict[str, Fraction]) -> ExactMDP | ExactPOMDP:
+    instance = model.with_parameters(values)
+    return enumerate_model(instance) if model.observability == "full" else enumerate_pomdp(instance)
+
+
+def brute_force(exact: ExactMDP | ExactPOMDP) -> tuple[int, ...]:
+    """The coarsest stable partition: the block of each state."""
+    if isinstance(exact, ExactMDP):
+        return minimiser.minimise(exact).block_of
+    return minimiser.minimise_pomdp(exact).block_of
+
+
+def blocks_of(quotient: ParametricQuotient, exact: ExactMDP | ExactPOMDP) -> np.ndarray:
+    """The quotient's block of each enumerated state."""
+    symbolic = quotient.process.process.symbolic
+    from factored_polca.diagrams import evaluate_states
+
+    digits = [[f.index(v) for f, v in zip(exact.features, s, strict=True)] for s in exact.state_values]
+    states = np.array(digits, dtype=np.int32)
+    return evaluate_states(quotient.partition.diagram, states, symbolic.columns()).astype(np.int64)
+
+
+def refines(fine: list[int], coarse: tuple[int, ...]) -> bool:
+    """Whether each class of `fine` lies in one of `coarse`."""
+    return len(set(zip(fine, coarse, strict=True))) == len(set(fine))
+
+
+CASES = [(kind, seed) for kind in ("mdp", "pomdp") for seed in range(MODELS)]
+
+
+@pytest.mark.parametrize(("kind", "seed"), CASES)
+def test_the_partition_is_the_coarsest_at_a_generic_setting(kind: str, seed: int) -> None:
+    model, quotient = reduced(kind, seed)
+    for draw in range(2):
+        exact = enumerated(model, generic(100 * seed + draw))
+        mine, coarse = blocks_of(quotient, exact).tolist(), brute_force(exact)
+        assert refines(mine, coarse)
+        assert len(set(mine)) == len(set(coarse)) == quotient.partition.blocks
+
+
+@pytest.mark.parametrize(("kind", "seed"), CASES)
+def test_the_instance_is_the_quotient_of_the_instantiated_model_or_finer(kind: str, seed: int) -> None:
+    model, quotient = reduced(kind, seed)
+    for number, values in enumerate(settings(seed, SETTINGS)):
+        exact = enumerated(model, values)
+        block = blocks_of(quotient, exact).tolist()
+        assert refines(block, brute_force(exact)), values
+        check_rows(quotient, exact, block, values, exactly=number % 5 == 0)
+        if isinstance(exact, ExactMDP):
+            check_values(quotient, exact, block, values)
+        else:
+            check_forward(quotient, exact, block, values, seed)
+
+
+def check_rows(
+    quotient: ParametricQuotient,
+    exact: ExactMDP | ExactPOMDP,
+    block: list[int],
+    values: dict[str, Fraction],
+    exactly: bool,
+) -> None:
+    """The rows and rewards of the instance are those of every state of the block."""
+    rows = exact.rows if isinstance(exact, ExactMDP) else exact.kernel
+    mdp = quotient.mdp(values) if isinstance(exact, ExactMDP) else quotient.pomdp(values).to_mdp()
+    for a in range(len(exact.actions)):
+        dense = mdp.transitions[a].toarray()
+        known: dict[int, dict[int, Fraction]] = {}
+        for s, b in enumerate(block):
+            sums: dict[int, Fraction] = {}
+            for key, chance in rows[a][s].items():
+                target = block[key[0] if isinstance(key, tuple) else key]
+                sums[target] = sums.get(target, Fraction(0)) + chance
+            assert known.setdefault(b, sums) == sums
+            expected = np.zeros(len(dense))
+            for target, chance in sums.items():
+                expected[target] = float(chance)
+            np.testing.assert_allclose(dense[b], expected, rtol=0, atol=1e-12)
+            assert mdp.rewards[a, b] == pytest.approx(float(exact.rewards[a][s]), rel=1e-12, abs=1e-12)
+            assert mdp.terminal[b] == exact.terminal[s]
+            if isinstance(exact, ExactMDP):
+                assert mdp.applicable[a, b] == exact.applicable[a][s]
+        if exactly:
+            for b, sums in known.items():
+                found: dict[int, Fraction] = {}
+                for (target, _), chance in quotient.exact_row(a, b, values).items():
+                    found[target] = found.get(target, Fraction(0)) + chance
+                assert found == sums
+                assert quotient.exact_reward(a, b, values) == exact.rewards[a][block.index(b)]
+    initial = np.zeros(quotient.partition.blocks)
+    for s, chance in enumerate(exact.initial):
+        initial[block[s]] += float(chance)
+    np.testing.assert_allclose(quotient.initial_distribution(values), initial, rtol=0, atol=1e-12)
+
+
+def check_values(
+    quotient: ParametricQuotient, exact: ExactMDP, block: list[int], values: dict[str, Fraction]
+) -> None:
+    """The optimal values of the instance are those of the states, to 1e-9 of the largest.
+
+    A function v with max_a Q(v) = v within e is within e / (1 - discount) of the only one that has e = 0.
+    """
+    flat = exact.to_arrays()
+    found = solve_mdp(quotient.mdp(values), epsilon=1e-12).values[block]
+    lost = lost_states(flat)
+    assert np.array_equal(np.isneginf(found), lost)
+    backed = np.where(flat.terminal, 0.0, action_values(flat, found).max(axis=0))
+    scale = max(1.0, float(np.abs(found[~lost]).max(initial=0.0)))
+    assert np.abs(backed - found)[~lost].max(initial=0.0) <= 1e-9 * scale * (1 - flat.discount)
+
+
+def check_forward(
+    quotient: ParametricQuotient,
+    exact: ExactPOMDP,
+    block: list[int],
+    values: dict[str, Fraction],
+    seed: int,
+) -> None:
+    """The optimal values of two steps from b0 and from random beliefs are those of the model."""
+    flat, small = exact.to_arrays(), quotient.pomdp(values)
+    generator = np.random.default_rng(seed)
+    beliefs = np.vstack([flat.initial, generator.dirichlet(np.full(flat.states, 0.4), size=2)])
+    beliefs[1:] = [_seen_alike(belief, flat.observed) for belief in beliefs[1:]]
+    projected = np.zeros((len(beliefs), small.states))
+    for s, b in enumerate(block):
+        projected[:, b] += beliefs[:, s]
+    wanted, found = (forward_values(*pair, 2) for pair in ((flat, beliefs), (small, projected)))
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+def _seen_alike(belief: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """The part of a belief on what is seen of its likeliest state, as a belief."""
+    part = np.where(observed == observed[belief.argmax()], belief, 0.0)
+    return part / part.sum()
