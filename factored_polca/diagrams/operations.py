@@ -369,10 +369,9 @@ def choose(condition: Diagram, then: Diagram, otherwise: Diagram) -> Diagram:
 def sum_options(
     manager: Manager, leaf_type: LeafType, normalised: bool, step: float = 0.0
 ) -> npt.NDArray[np.int64]:
-    """The options of weighted sums; sums of floats become multiples of `step`, a power of 2, unless it is 0."""
-    is_field, number = isinstance(leaf_type, Field), manager.step_number(step)
-    if isinstance(leaf_type, Field):
-        number = manager.field_number(leaf_type)
+    """The options of weighted sums; floats are rounded to multiples of `step`, a power of 2 or 0 (none)."""
+    is_field = isinstance(leaf_type, Field)
+    number = manager.field_number(leaf_type) if isinstance(leaf_type, Field) else manager.step_number(step)
     zero, one = manager.constant(0, leaf_type), manager.constant(1, leaf_type)
     bits = int(np.float64(step).view(np.int64))
     values = [zero.node, one.node, normalised, 2 * number + normalised, not is_field, bits]

@@ -230,7 +230,7 @@ def executable_by_classes(
     """
     without = [s.task.name for s in plan.solved if isinstance(s, StructuredTask)]
     if without:
-        raise ValueError(f"task {without[0]!r} was solved on diagrams: it has no blocks to be merged")
+        raise ModelError(f"task {without[0]!r} was solved on diagrams: it has no blocks to be merged")
     solved = [s for s in plan.solved if isinstance(s, SolvedTask)]
     policies = {s.task.name: value_classes(s, kind, within).policy for s in solved}
     return replace(executable(plan, report), policies=policies)

@@ -341,7 +341,8 @@ class _Run:
         """The policy by the tie rule, its loss measured."""
         bellman, known = self.bellman, self.known
         try:
-            choices = bellman.greedy(q_values, best, gap=2 * known.radius)
+            gap = min(2 * known.radius, TIE_TOLERANCE * max(1.0, self.largest))  # a wide one would cost
+            choices = bellman.greedy(q_values, best, gap)
             drop, _ = bellman.extremes(bellman.chosen(choices, q_values) - best)
         except MemoryLimit:
             return
