@@ -20,9 +20,14 @@ from factored_polca.cli.commands import (
 from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
-from factored_polca.cli.solve_symbolic import SYMBOLIC, solve_on_diagrams
+from factored_polca.cli.solve_symbolic import (
+    SYMBOLIC,
+    listed_unless_many,
+    may_be_symbolic,
+    solve_on_diagrams,
+)
 from factored_polca.cli.source import Source, UsageError, load
-from factored_polca.models import LimitReached, Model
+from factored_polca.models import Model
 from factored_polca.models.model import replace_fields
 
 if TYPE_CHECKING:
@@ -107,15 +112,15 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
         return solve_on_diagrams(task, source, arguments, output)
     compile_seconds = warm(task, output)
     began = time.perf_counter()
-    try:
-        with source.located(), output.progress(f"listing the states of {source.name}"):
-            symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
+    with source.located(), output.progress(f"listing the states of {source.name}"):
+        symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
+        if may_be_symbolic(task):
+            flat = listed_unless_many(symbolic, task)
+        else:
             flat = listed_unless_large(symbolic, task)
-    except LimitReached as error:
-        if task.solver != "auto" or task.as_mdp or task.model.horizon is not None:
-            raise
-        return solve_on_diagrams(task, source, arguments, output, f"not listed: {error}")
     if isinstance(flat, str):
+        if may_be_symbolic(task):
+            return solve_on_diagrams(task, source, arguments, output, flat)
         return solve_large(symbolic, task, flat, source, arguments, output, compile_seconds)
     build_seconds = time.perf_counter() - began
     with output.progress(f"solving {source.name}"):

@@ -7,15 +7,18 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, Final
 
-from factored_polca.cli.commands import compile_kernels
+from factored_polca.cli.commands import compile_kernels, limits
 from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
 from factored_polca.cli.solve_report import status_text, value_text
 from factored_polca.cli.source import Source, UsageError
+from factored_polca.models import LimitReached
 
 if TYPE_CHECKING:
     from factored_polca.cli.solve import Task
+    from factored_polca.minimisation.flat_model import FlatModel
     from factored_polca.structured.pomdp_solution import SymbolicSolution
+    from factored_polca.symbolic import SymbolicModel
 
 SYMBOLIC: Final = "symbolic"
 QUIET_SECONDS: Final = 0.1
@@ -40,6 +43,26 @@ def refuse(source: Source, task: Task) -> None:
         )
 
 
+def may_be_symbolic(task: Task) -> bool:
+    """Whether a model is solved on diagrams where its states are too many to list."""
+    partial = task.model.observability == "partial"
+    return partial and task.solver == "auto" and task.model.horizon is None
+
+
+def listed_unless_many(symbolic: SymbolicModel, task: Task) -> FlatModel | str:
+    """The model as arrays, or why it is solved without listing its states."""
+    from factored_polca.cli.solve import listed
+    from factored_polca.cli.solve_large import too_many
+
+    reason = too_many(symbolic, task)
+    if reason:
+        return reason
+    try:
+        return listed(symbolic, task)
+    except LimitReached as error:
+        return str(error)
+
+
 def solve_on_diagrams(
     task: Task, source: Source, arguments: argparse.Namespace, output: Output, reason: str = ""
 ) -> int:
@@ -55,7 +78,7 @@ def solve_on_diagrams(
     compile_seconds = compile_kernels(output)
     began = time.perf_counter()
     with source.located(), output.progress(f"compiling {source.name}"):
-        symbolic = compile_model(task.model)
+        symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
     build_seconds = time.perf_counter() - began
     last = 0.0
 

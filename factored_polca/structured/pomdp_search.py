@@ -23,6 +23,8 @@ from typing import Final
 
 import numpy as np
 
+from factored_polca.diagrams import MemoryLimit
+from factored_polca.diagrams.manager import available_memory
 from factored_polca.structured.pomdp_belief import BELIEF_ERROR, BeliefSpace
 from factored_polca.structured.pomdp_lower import Alpha, LowerBound
 from factored_polca.structured.pomdp_model import UNIT, Seen, Step
@@ -34,6 +36,10 @@ DEEPEST: Final = 400
 
 SHARE: Final = 0.8
 """A trial aims at this share of the gap that there is."""
+
+LOOKED_AT: Final = 500
+SPARE: Final = 256 << 20
+"""Each time so many beliefs were added, so many bytes must be free."""
 
 PRUNE_AT: Final = 60
 """Alpha-vectors of one y beyond those kept, before the useless ones are set aside."""
@@ -105,6 +111,8 @@ class Search:
         if found is None:
             if len(self.nodes) >= self.belief_limit:
                 raise TooManyBeliefs
+            if len(self.nodes) % LOOKED_AT == LOOKED_AT - 1 and available_memory() < SPARE:
+                raise MemoryLimit(f"{len(self.nodes):,} beliefs and what is known of them fill the memory")
             quality = self.space.expectations(belief, self.upper.at(belief.seen).forest)
             quality = quality + self.read_error
             values = self.lower.values(belief)
