@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from parametric_models import generic, parametric_mdp, parametric_pomdp, settings
 
-from factored_polca.diagrams import evaluate_states
+from factored_polca.diagrams import FLOAT, evaluate_states, relabel
 from factored_polca.explicit import minimiser
 from factored_polca.explicit.alpha_expansion import forward_values
 from factored_polca.explicit.dynamic_programming import action_values, evaluate_policy, lost_states
@@ -21,13 +21,14 @@ from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.explicit.exact_pomdp import ExactPOMDP, enumerate_pomdp
 from factored_polca.minimisation import Reduction
-from factored_polca.models import Model
+from factored_polca.models import Action, Model, boolean, lottery, parse
 from factored_polca.parametric import (
     ParametricQuotient,
     parametric_flat_process,
     reduce_parametric,
 )
 from factored_polca.solvers.choose import solve_mdp
+from factored_polca.symbolic import NumericView
 
 MODELS = 30  # of each kind
 SETTINGS = 20
@@ -206,3 +207,19 @@ def _seen_alike(belief: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """The part of a belief on what is seen of its likeliest state, as a belief."""
     part = np.where(observed == observed[belief.argmax()], belief, 0.0)
     return part / part.sum()
+
+
+def test_settings_that_share_a_manager_are_not_confused() -> None:
+    """Regressions are remembered by action: each setting's numbers must count as another model's."""
+    x = boolean("x")
+    chance = parse("p")
+    model = Model(
+        "coin", [x], [Action("toss", {x: lottery({True: chance, False: 1 - chance})})],
+        rewards=["1 if x else 0"], initial={x: False}, discount="0.5", parameters={"p": Fraction(1, 3)},
+    )  # fmt: skip
+    process = parametric_flat_process(model)
+    for setting in (Fraction(1, 4), Fraction(3, 4), Fraction(0), Fraction(1), Fraction(1, 4)):
+        symbolic = process.at({"p": setting}).symbolic
+        manager = symbolic.manager
+        on = relabel(manager.indicator(symbolic.now(0), [1]), np.array([0.0, 1.0]), FLOAT)
+        assert NumericView(symbolic).regress(0, on) == manager.constant(float(setting), FLOAT)

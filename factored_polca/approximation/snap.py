@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from itertools import count
 from typing import Any, TypeVar
 
 import numpy as np
@@ -39,8 +38,7 @@ from factored_polca.minimisation import DecisionProcess
 from factored_polca.models import Fault, ModelError
 from factored_polca.symbolic import RowDiagram, SymbolicAction, SymbolicModel, Term
 from factored_polca.symbolic.rows import Row
-
-_variants = count(1)
+from factored_polca.symbolic.variants import fresh_variant
 
 Key = TypeVar("Key", bound=Hashable)
 Sets = tuple[Diagram, list[frozenset[Any]]]
@@ -126,7 +124,7 @@ def snap(symbolic: SymbolicModel, epsilon: Fraction | float | str) -> Snapped:
     work = _Snapping(symbolic, bound)
     actions = tuple(work.action(action) for action in symbolic.actions) if bound else symbolic.actions
     before, after = row_count(symbolic.actions), row_count(actions)
-    snapped = replace(symbolic, actions=actions, variant=next(_variants)) if bound else symbolic
+    snapped = replace(symbolic, actions=actions, variant=fresh_variant()) if bound else symbolic
     return Snapped(symbolic, snapped, bound, work.changed, before, after, work.parents)
 
 

@@ -16,6 +16,7 @@ from factored_polca.minimisation import DecisionProcess
 from factored_polca.models.model import Model
 from factored_polca.symbolic import RowDiagram, SymbolicAction, SymbolicModel, Term
 from factored_polca.symbolic.rows import Row
+from factored_polca.symbolic.variants import fresh_variant
 
 Image = Callable[[Fraction], Fraction]
 """What a number is replaced by."""
@@ -77,6 +78,7 @@ class Substitution:
             model=symbolic.model if model is None else model,
             actions=tuple(map(self.action, symbolic.actions)),
             initial=self.rows(symbolic.initial),
+            variant=fresh_variant(),
         )
 
     def process(self, process: DecisionProcess, model: Model | None = None) -> DecisionProcess:
