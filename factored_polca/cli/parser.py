@@ -53,9 +53,10 @@ SOLVE_NOTES = """solvers:
                                 the module is imported, so name only what you trust
 
 --gap and --epsilon are one thing: upper - lower at the start.  Without them 0.001, for exact 1e-6; fully
-observed models are solved to 1e-9 of the largest value.  There is no time limit but --time, which counts
-the solving only.  Only states that the start can reach are listed.  Where these are too many, auto solves a
-fully observed model over the blocks of its quotient, and where those are too many on diagrams.
+observed models are solved to 1e-9 of the largest value.  There is no time limit but --time; listing
+the states may take as long, and then solving.  Only states that the start can reach are listed.  Where
+these are too many, auto solves a fully observed model over the blocks of its quotient, and where those
+are too many on diagrams.
 
 exit status: 0 with a result, also where --time or --iterations stopped the solver; 130 after Ctrl-C, with
 the result so far printed and written if there is one; 3 where memory or another limit was reached.

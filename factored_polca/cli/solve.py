@@ -27,7 +27,7 @@ from factored_polca.cli.solve_symbolic import (
     solve_on_diagrams,
 )
 from factored_polca.cli.source import Source, UsageError, load
-from factored_polca.models import Model
+from factored_polca.models import LimitReached, Model
 from factored_polca.models.model import replace_fields
 
 if TYPE_CHECKING:
@@ -284,14 +284,22 @@ def warm(task: Task, output: Output) -> float:
 
 
 def listed(symbolic: SymbolicModel, task: Task) -> FlatModel:
-    """The model as arrays.
+    """The model as arrays; the time that there is counts for this alone.
 
     Raises:
+        LimitReached: too many states, or time.
         UsageError: a POMDP solver, and an action that does not apply everywhere.
     """
+    from factored_polca.diagrams import Aborted
     from factored_polca.minimisation.flat_model import flat_model
 
-    flat = flat_model(symbolic)
+    symbolic.manager.deadline = task.deadline()
+    try:
+        flat = flat_model(symbolic)
+    except Aborted as error:
+        raise LimitReached(f"listing the states: {error}", "listing") from None
+    finally:
+        symbolic.manager.deadline = None
     if not task.as_mdp and flat.partial_action is not None:
         raise UsageError(
             f"{task.solver} would solve {task.model.name} as a POMDP whose state is seen, where actions "
