@@ -219,7 +219,7 @@ class ParametricQuotient:
     def row(self, choice: int, block: int) -> dict[tuple[int, int], Fraction]:
         """The probability of each (next block, observation), as functions of the parameters.
 
-        They are `RationalFunction`s, or Fractions where they are constant.
+        They are of the type `RationalFunction`, or Fractions where they are constant.
 
         Raises:
             LimitReached: functions of more degrees, terms or digits than are written out.
