@@ -173,12 +173,16 @@ def distinct_rewards(
     present = np.flatnonzero(example >= 0)
     place = np.zeros(size, dtype=np.int64)
     place[present] = np.arange(len(present))
+    rows = np.stack([entry[example[present]] for entry in entries], axis=1).tolist()
+    if process.open_numbers is not None:  # functions of parameters have no common denominator
+        tables = [term.values for term in terms]
+        open_sums = [sum((t[n] for t, n in zip(tables, row, strict=True)), Fraction(0)) for row in rows]
+        return open_sums, place[key]
     common = lcm(*(value.denominator for term in terms for value in term.values))
     cleared = [[int(value * common) for value in term.values] for term in terms]
-    rows = np.stack([entry[example[present]] for entry in entries], axis=1)
     sums = [
         Fraction(sum([values[number] for values, number in zip(cleared, row, strict=True)]), common)
-        for row in rows.tolist()
+        for row in rows
     ]
     return sums, place[key]
 
