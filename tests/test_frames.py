@@ -69,7 +69,7 @@ def test_a_partition_has_exact_sizes_beyond_64_bits() -> None:
     symbolic = fp.compile_model(fp.load_domain("linear", {"size": 80}).model)
     frame = fp.minimise(fp.flat_process(symbolic)).to_frame()
     assert frame["states"].tolist() == [2 ** (79 - k) for k in range(80)] + [1]
-    assert frame["where"][1] == "x_0 and not x_1"
+    assert sorted(frame["where"][1].split(" and ")) == ["not x_1", "x_0"]
     assert len(frame) == 81
 
 

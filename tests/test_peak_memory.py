@@ -28,6 +28,7 @@ LINES = {
     "figure": ["figure", "4a", "cheese_taxi", "--trials", "1"],
     "bench": ["bench", "--list"],
     "study": ["study", "new", "small.toml"],
+    "sensitivity": ["sensitivity", "tiger", "--set-range", "accuracy=0.8..0.9:2"],
 }
 """A line for each command; `bench` and `study` here only say what they would do."""
 
