@@ -22,7 +22,6 @@ from factored_polca.cli.output import Output, finite
 from factored_polca.cli.solve_report import print_solution
 from factored_polca.cli.solve_symbolic import (
     SYMBOLIC,
-    listed_unless_many,
     may_be_symbolic,
     solve_on_diagrams,
 )
@@ -114,10 +113,7 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
     began = time.perf_counter()
     with source.located(), output.progress(f"listing the states of {source.name}"):
         symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
-        if may_be_symbolic(task):
-            flat = listed_unless_many(symbolic, task)
-        else:
-            flat = listed_unless_large(symbolic, task)
+        flat = listed_unless_large(symbolic, task)
     if isinstance(flat, str):
         if may_be_symbolic(task):
             return solve_on_diagrams(task, source, arguments, output, flat)

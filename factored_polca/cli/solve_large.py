@@ -64,7 +64,7 @@ def listed_unless_large(symbolic: SymbolicModel, task: Task) -> FlatModel | str:
 
     if task.solver == "structured":
         return ""
-    if not (task.as_mdp and task.solver == "auto" and task.model.horizon is None):
+    if task.solver != "auto" or task.model.horizon is not None:
         return listed(symbolic, task)
     reason = too_many(symbolic, task)
     if reason:

@@ -12,13 +12,10 @@ from factored_polca.cli.memory import peak_memory_bytes
 from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
 from factored_polca.cli.solve_report import status_text, value_text
 from factored_polca.cli.source import Source, UsageError
-from factored_polca.models import LimitReached
 
 if TYPE_CHECKING:
     from factored_polca.cli.solve import Task
-    from factored_polca.minimisation.flat_model import FlatModel
     from factored_polca.structured.pomdp_solution import SymbolicSolution
-    from factored_polca.symbolic import SymbolicModel
 
 SYMBOLIC: Final = "symbolic"
 QUIET_SECONDS: Final = 0.1
@@ -47,20 +44,6 @@ def may_be_symbolic(task: Task) -> bool:
     """Whether a model is solved on diagrams where its states are too many to list."""
     partial = task.model.observability == "partial"
     return partial and task.solver == "auto" and task.model.horizon is None
-
-
-def listed_unless_many(symbolic: SymbolicModel, task: Task) -> FlatModel | str:
-    """The model as arrays, or why it is solved without listing its states."""
-    from factored_polca.cli.solve import listed
-    from factored_polca.cli.solve_large import too_many
-
-    reason = too_many(symbolic, task)
-    if reason:
-        return reason
-    try:
-        return listed(symbolic, task)
-    except LimitReached as error:
-        return str(error)
 
 
 def solve_on_diagrams(
