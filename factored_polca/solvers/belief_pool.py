@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.solvers.batched_backup import posteriors, steps
@@ -151,6 +150,8 @@ def _all_successors(
 
 def _distances(beliefs: FloatArray, others: FloatArray) -> FloatArray:
     """The L1 distance [m] of each belief to the nearest of `others`; 2, the largest, if there are none."""
+    from scipy.spatial.distance import cdist  # takes long to import
+
     result = np.full(len(beliefs), 2.0)
     if len(others) == 0:
         return result

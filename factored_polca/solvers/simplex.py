@@ -33,7 +33,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linprog
 
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.models.errors import LimitReached
@@ -269,6 +268,8 @@ def game_value_by_highs(matrix: FloatArray) -> tuple[float, FloatArray, FloatArr
     Raises:
         LimitReached: HiGHS found no answer.
     """
+    from scipy.optimize import linprog  # takes long to import, and is seldom needed
+
     count, i = matrix.shape
     scale = float(np.abs(matrix).max(initial=0.0)) or 1.0
     result = linprog(
