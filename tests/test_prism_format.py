@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from fractions import Fraction
 from importlib.util import find_spec
@@ -330,6 +331,31 @@ def test_a_parser_that_misbehaves_is_a_clear_error(
     with pytest.raises(ModelError) as caught:
         parse_program("mdp", lambda line, column: (line, column))
     assert message in str(caught.value)
+
+
+@with_storm
+def test_an_answer_that_reads_a_reward_otherwise_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = """dtmc
+module m x : [0..1]; [] true -> (x'=1-x); endmodule
+rewards x=0 : 3; endrewards"""
+    run = prism_process._run
+    changed = []
+
+    def cut(folder: Path) -> tuple[bytes, int]:
+        answer, code = run(folder)
+        data = json.loads(answer)
+        for node in data["nodes"]:
+            if node[0] == "EQUAL" and data["nodes"][node[2]][0] == "name":
+                changed.append(node.pop())
+        return json.dumps(data).encode(), code
+
+    assert enumerate_model(read_prism(text, {"discount": "0.9"})[0]).rewards[0] == (F(3), F(0))
+    monkeypatch.setattr(prism_process, "_run", cut)
+    with pytest.raises(ModelError) as caught:
+        read_prism(text, {"discount": "0.9"})
+    assert len(changed) == 1
+    assert "reads otherwise" in str(caught.value)
+    assert caught.value.faults[0].line == 3
 
 
 @with_storm
