@@ -17,6 +17,7 @@ from factored_polca.explicit.exact_dynamic_programming import optimal_solution
 from factored_polca.explicit.exact_mdp import ExactMDP
 from factored_polca.formats import prism_process, read, write
 from factored_polca.formats.prism import read_prism
+from factored_polca.formats.prism_expressions import number
 from factored_polca.formats.prism_process import RawProgram, parse_program
 from factored_polca.formats.prism_spelling import Spelling
 from factored_polca.formats.prism_text import scan
@@ -316,6 +317,8 @@ def test_without_stormpy_the_message_names_the_extra(
         ("print('[1, 2]')", "can't be read"),
         ("import json; print(json.dumps({'version': '1.9.0', 'nodes': []}))", "1.9.0 is installed"),
         ("import json; print(json.dumps({'version': '2.0.0', 'nodes': [['AND', 0, 1]]}))", "can't be read"),
+        ("import json; print(json.dumps({'version': '2.0.0', 'nodes': [['int', '1'], ['AND', 0]]}))",
+         "can't be read"),
         ("import time; time.sleep(600)", "was stopped"),
         ("while True: print('x' * 10**6)", "too large"),
     ],
@@ -334,7 +337,7 @@ def test_a_parser_that_misbehaves_is_a_clear_error(
 
 
 @with_storm
-def test_an_answer_that_reads_a_reward_otherwise_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_whose_operator_lacks_a_part_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     text = """dtmc
 module m x : [0..1]; [] true -> (x'=1-x); endmodule
 rewards x=0 : 3; endrewards"""
@@ -354,8 +357,14 @@ rewards x=0 : 3; endrewards"""
     with pytest.raises(ModelError) as caught:
         read_prism(text, {"discount": "0.9"})
     assert len(changed) == 1
-    assert "reads otherwise" in str(caught.value)
-    assert caught.value.faults[0].line == 3
+    assert "gave an answer that can't be read" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["9" * 4001, "-1/" + "9" * 4001, "7" * 5000 + "/3"])
+def test_long_numbers_of_an_answer_are_refused(text: str) -> None:
+    with pytest.raises(ModelError, match="more than 4000 digits"):
+        number(text)
+    assert number("-10/4") == F(-5, 2)
 
 
 @with_storm

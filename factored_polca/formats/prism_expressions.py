@@ -45,9 +45,9 @@ def number(text: str) -> Fraction:
     Raises:
         ModelError: it is too long.
     """
-    if len(text) > 2 * MAXIMUM_DIGITS:
-        raise ModelError(f"a number of more than {2 * MAXIMUM_DIGITS} digits")
     over, _, under = text.partition("/")
+    if max(len(over.lstrip("-")), len(under)) > MAXIMUM_DIGITS:
+        raise ModelError(f"a number of more than {MAXIMUM_DIGITS} digits")
     if under and not int(under):
         raise ModelError("a number with the denominator 0")
     value = Fraction(int(over), int(under or 1))

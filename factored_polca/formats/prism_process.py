@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -235,6 +235,16 @@ def _text(value: Any) -> str:
     return value
 
 
+_BINARY: Final = (
+    "AND", "OR", "IFF", "XOR", "IMPLIES", "EQUAL", "NOT_EQUAL", "LESS", "LESS_OR_EQUAL", "GREATER",
+    "GREATER_OR_EQUAL", "PLUS", "TIMES", "DIVIDE", "MIN", "MAX", "POWER", "MODULO",
+)  # fmt: skip
+_PARTS: Final[Mapping[str, tuple[int, ...]]] = {
+    "NOT": (1,), "FLOOR": (1,), "CEIL": (1,), "MINUS": (1, 2), "ITE": (3,),
+} | dict.fromkeys(_BINARY, (2,))  # fmt: skip
+"""How many parts an operator has; of one that is not read, any number."""
+
+
 def _node(row: Any, index: int) -> tuple[Any, ...]:
     if not isinstance(row, list) or not row or not isinstance(row[0], str):
         raise TypeError("a node that is none")
@@ -250,6 +260,8 @@ def _node(row: Any, index: int) -> tuple[Any, ...]:
             raise TypeError("a node that is none")
     elif not _are_before(rest, index):
         raise ValueError("a node before its parts")
+    elif len(rest) not in _PARTS.get(kind, (len(rest),)):
+        raise ValueError("a node with parts too many or too few")
     return (kind, *rest)
 
 

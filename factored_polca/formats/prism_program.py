@@ -204,7 +204,7 @@ class _Build:
     def reward(self, node: int, place: Place) -> Expression:
         """The value v behind the guard `v = c`; see `Scan.for_the_parser`."""
         kind, *parts = self.raw.nodes[node]
-        if kind != "EQUAL" or len(parts) != 2 or self.raw.nodes[parts[1]] != ("name", self.scan.constant):
+        if kind != "EQUAL" or self.raw.nodes[parts[1]] != ("name", self.scan.constant):
             raise self.fault("a reward that the parser reads otherwise", place)
         return self.translate(parts[0])
 
