@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
-from factored_polca.diagrams.jit import inline, int64, lean_kernel
+from factored_polca.diagrams.jit import inline, inner_kernel, int64, lean_kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
@@ -63,7 +63,7 @@ def float_payload(value: float) -> np.uint64:
     return np.float64(value + 0.0).view(np.uint64)
 
 
-@lean_kernel
+@inner_kernel
 def leaf_value(code: int, x: np.uint64, y: np.uint64, prime: np.uint64, inverse: np.uint64) -> np.uint64:
     """The payload of op(x, y) for payloads x, y; conditions need none, see `shortcut`."""
     if code == FIELD_ADD:

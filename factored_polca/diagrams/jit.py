@@ -27,8 +27,11 @@ KERNELS: list[Any] = []
 
 
 def kernel(function: Function) -> Function:
-    """Compile `function` on first use and keep the machine code on disk."""
-    compiled = numba.njit(cache=True, error_model="numpy")(function)
+    """Compile `function` on first use and keep the machine code on disk.
+
+    Nothing calls kernels through C, so that no wrapper for it is compiled.
+    """
+    compiled = _njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     KERNELS.append(compiled)
     return cast(Function, compiled)
 
@@ -39,14 +42,32 @@ def lean_kernel(function: Function) -> Function:
     It counts no references to the arrays that it passes on, which took a fifth of the time where small
     kernels are called for every node.
     """
-    compiled = _njit(cache=True, error_model="numpy", _nrt=False)(function)
+    compiled = _njit(cache=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)(function)
+    KERNELS.append(compiled)
+    return cast(Function, compiled)
+
+
+def inner_kernel(function: Function) -> Function:
+    """A lean kernel that only kernels call: Python can't."""
+    compiled = _njit(
+        cache=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True, no_cpython_wrapper=True
+    )(function)
     KERNELS.append(compiled)
     return cast(Function, compiled)
 
 
 def inline(function: Function) -> Function:
     """Compile `function`, which makes no arrays, into each kernel that calls it."""
-    return cast(Function, _njit(forceinline=True, error_model="numpy", _nrt=False)(function))
+    return cast(
+        Function,
+        _njit(
+            forceinline=True,
+            error_model="numpy",
+            _nrt=False,
+            no_cfunc_wrapper=True,
+            no_cpython_wrapper=True,
+        )(function),
+    )
 
 
 def compiled_before() -> bool:

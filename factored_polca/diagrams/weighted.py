@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams.apply import cache_index, float_payload
 from factored_polca.diagrams.field import field_add, field_multiply
-from factored_polca.diagrams.jit import inline, int64, lean_kernel
+from factored_polca.diagrams.jit import inline, inner_kernel, int64, lean_kernel
 from factored_polca.diagrams.nodes import (
     DONE,
     FULL,
@@ -272,7 +272,7 @@ def run_weighted_sum(
     return DONE
 
 
-@lean_kernel
+@inner_kernel
 def collect_possible(
     pool: Int32Array, arity: Int32Array, root: int, nodes: Int32Array, stack: Int32Array,
     weights: Int32Array, first_weight: Int64Array, last_changed: int, zero: int,

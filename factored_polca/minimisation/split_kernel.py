@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams.apply import apply_binary
 from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
-from factored_polca.diagrams.jit import int64, lean_kernel
+from factored_polca.diagrams.jit import inner_kernel, int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, FULL, Int32Array, Int64Array, find_or_add, payload
 from factored_polca.diagrams.walk import collect
 
@@ -83,7 +83,7 @@ def shares(
             rough[number] += part
 
 
-@lean_kernel
+@inner_kernel
 def number_parts(
     pool: Int32Array, nodes: Int32Array, count: int, leaf_level: int, field: UInt64Array,
     exact: UInt64Array, rough: npt.NDArray[np.float64], numbers: Int64Array, elements: UInt64Array,
@@ -149,7 +149,7 @@ def number_parts(
     return split
 
 
-@lean_kernel
+@inner_kernel
 def rebuild_with(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, nodes: Int32Array,
     count: int, new_blocks: Int32Array, changes: UInt64Array, which: int, images: Int32Array,
@@ -177,7 +177,7 @@ def rebuild_with(
     return DONE
 
 
-@lean_kernel
+@inner_kernel
 def run_split(
     pool: Int32Array, head: Int64Array, unique: Int64Array, arity: Int32Array, cache: Int32Array,
     stack: Int32Array, results: Int32Array, words: Int32Array, by: int, operators: npt.NDArray[np.int64],
