@@ -17,9 +17,8 @@ from factored_polca.cli.commands import (
     refuse_unwritable,
     report_warnings,
 )
-from factored_polca.cli.memory import peak_memory_bytes
-from factored_polca.cli.output import Output, finite
-from factored_polca.cli.solve_report import print_solution
+from factored_polca.cli.output import Output
+from factored_polca.cli.solve_report import conclude, described, print_solution, shown
 from factored_polca.cli.solve_symbolic import (
     SYMBOLIC,
     may_be_symbolic,
@@ -50,8 +49,6 @@ GAP: Final = 1e-3
 EXACT_GAP: Final = 1e-6
 MDP_EPSILON: Final = 1e-9
 LONGEST_HORIZON: Final = 1_000_000
-QUIET_SECONDS: Final = 0.1
-"""Least time between two progress messages."""
 
 
 @dataclass(frozen=True)
@@ -122,53 +119,19 @@ def solve(arguments: argparse.Namespace, output: Output) -> int:
     with output.progress(f"solving {source.name}"):
         found, compiled = work(task, flat, source, output)
     compile_seconds += compiled
-    data = {
-        "model": task.model.name,
-        "observability": task.model.observability,
-        "discount": str(task.model.discount),
-        "horizon": task.model.horizon,
-        "states": task.model.states,
+    data = described(task, found, wanted(task), found.value) | {
         "reachable_states": flat.pomdp.states,
-        "actions": len(flat.pomdp.actions),
         "observations": count_observations(flat),
-        "blocks": None,  # the model is solved as it is, without merging states
-        "solver": task.solver,
-        "method": found.method,
-        "gap_wanted": wanted(task),
-        **summary(found),
         "vectors": found.vectors,
-        "iterations": found.iterations,
-        "seed": task.seed,
         "seconds": max(0.0, found.seconds - compiled),
         "compile_seconds": compile_seconds,
         "build_seconds": build_seconds,
-        "parse_seconds": source.parse_seconds,
     }
-    if arguments.output is not None:
-        kept = {name: item for name, item in data.items() if not name.endswith("seconds")}
-        save_policy(FlatPolicy(flat, found.policy, finite(kept)), arguments.output)
-    data["total_seconds"] = time.perf_counter() - arguments.began
-    data["peak_memory_bytes"] = peak_memory_bytes()
-    data["warnings"] = [str(warning) for warning in source.warnings]
-    if arguments.json:
-        output.result(data)
-    else:
-        print_solution(data, arguments, output)
-    return {"interrupted": 130, "memory limit": 3}.get(found.status, 0)
 
+    def save(kept: dict[str, Any], path: str) -> None:
+        save_policy(FlatPolicy(flat, found.policy, kept), path)
 
-def summary(found: Found) -> dict[str, Any]:
-    """What was found, in numbers and words."""
-    return {
-        "lower": found.lower,
-        "upper": found.upper,
-        "value": found.value,
-        "gap": found.gap,
-        "status": found.status,
-        "guarantee": found.guarantee.text,
-        "guarantee_kind": found.guarantee.kind,
-        "note": found.note,
-    }
+    return conclude(data, save, source, arguments, output, print_solution)
 
 
 def count_observations(flat: FlatModel) -> int | None:
@@ -308,14 +271,7 @@ def work(task: Task, flat: FlatModel, source: Source, output: Output) -> tuple[F
     """Solve; the solution, and how many seconds of it went into compiling what `warm` missed."""
     from factored_polca.solvers.compiled import watch_compiling
 
-    last = 0.0
-
-    def show(text: str) -> None:
-        nonlocal last
-        if time.monotonic() - last >= QUIET_SECONDS:
-            last = time.monotonic()
-            output.update(f"solving {source.name}: {text}")
-
+    show = shown(source, output)
     with watch_compiling() as compiling:
         if not task.as_mdp:
             found = solve_as_pomdp(task, flat, show)

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factored_polca.cli.memory import peak_memory_bytes
-from factored_polca.cli.output import Output, finite
-from factored_polca.cli.solve_report import print_solution
+from factored_polca.cli.output import Output
+from factored_polca.cli.solve_report import conclude, described, print_solution, shown
 from factored_polca.cli.source import Source
 from factored_polca.models import LimitReached
 
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from factored_polca.minimisation.flat_model import FlatModel
     from factored_polca.solvers.result import Guarantee, Status
     from factored_polca.symbolic import SymbolicModel
-
-EXIT: dict[str, int] = {"interrupted": 130, "memory limit": 3}
 
 
 @dataclass(frozen=True)
@@ -111,58 +108,19 @@ def solve_large(
     compile_seconds: float,
 ) -> int:
     """Solve without listing states, print bounds and what they mean, write the policy; the exit status."""
-    last = 0.0
-
-    def show(text: str) -> None:
-        nonlocal last
-        if time.monotonic() - last >= 0.1:
-            last = time.monotonic()
-            output.update(f"solving {source.name}: {text}")
-
     with source.located(), output.progress(f"solving {source.name}"):
-        found = work(symbolic, task, reason, show)
-    data: dict[str, Any] = {
-        "model": task.model.name,
-        "observability": task.model.observability,
-        "discount": str(task.model.discount),
-        "horizon": None,
-        "states": task.model.states,
-        "reachable_states": None,
-        "actions": len(task.model.actions),
-        "observations": None,
+        found = work(symbolic, task, reason, shown(source, output))
+    data = described(task, found, task.gap, found.value) | {
         "blocks": found.blocks,
-        "solver": task.solver,
-        "method": found.method,
-        "gap_wanted": task.gap,
-        "lower": found.lower,
-        "upper": found.upper,
-        "value": found.value,
-        "gap": found.gap,
-        "status": found.status,
-        "guarantee": found.guarantee.text,
-        "guarantee_kind": found.guarantee.kind,
-        "note": found.note,
-        "vectors": None,
-        "iterations": found.iterations,
-        "seed": task.seed,
-        "seconds": found.seconds,
         "compile_seconds": compile_seconds,
-        "build_seconds": 0.0,
-        "parse_seconds": source.parse_seconds,
     }
-    if arguments.output is not None:
+
+    def save(kept: dict[str, Any], path: str) -> None:
         from factored_polca.hierarchy.plan_file import save_plan
 
-        kept = {name: item for name, item in data.items() if not name.endswith("seconds")}
-        save_plan(one_task_plan(symbolic, found, finite(kept)), arguments.output)
-    data["total_seconds"] = time.perf_counter() - arguments.began
-    data["peak_memory_bytes"] = peak_memory_bytes()
-    data["warnings"] = [str(warning) for warning in source.warnings]
-    if arguments.json:
-        output.result(data)
-    else:
-        print_solution(data, arguments, output)
-    return EXIT.get(found.status, 0)
+        save_plan(one_task_plan(symbolic, found, kept), path)
+
+    return conclude(data, save, source, arguments, output, print_solution)
 
 
 def one_task_plan(symbolic: SymbolicModel, found: LargeSolution, report: dict[str, Any]) -> ExecutablePlan:

@@ -1,13 +1,126 @@
-"""What `solve` and the simulation of its policies say to people."""
+"""What `solve` keeps and says of what it found, whichever way it solved."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from factored_polca.cli.output import Output, big, escape, make_table, seconds
+from factored_polca.cli.memory import peak_memory_bytes
+from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
+from factored_polca.cli.source import Source
+
+if TYPE_CHECKING:
+    from factored_polca.cli.solve import Task
+    from factored_polca.solvers.result import Guarantee, Status
+
+QUIET_SECONDS: Final = 0.1
+"""Least time between two progress messages."""
+EXIT: Final[Mapping[str, int]] = {"interrupted": 130, "memory limit": 3}
+"""Exit statuses of what did not end by itself; of all else 0."""
+
+Print = Callable[[Mapping[str, Any], argparse.Namespace, Output], None]
+
+
+class Solution(Protocol):
+    """What every way of solving finds; bounds are on the optimal value from the start."""
+
+    @property
+    def lower(self) -> float: ...
+    @property
+    def upper(self) -> float: ...
+    @property
+    def gap(self) -> float: ...
+    @property
+    def status(self) -> Status: ...
+    @property
+    def guarantee(self) -> Guarantee: ...
+    @property
+    def method(self) -> str: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def note(self) -> str: ...
+
+
+def shown(source: Source, output: Output) -> Callable[[str], None]:
+    """Shows how far the solving is, not more often than every `QUIET_SECONDS`."""
+    last = -math.inf
+
+    def show(text: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= QUIET_SECONDS:
+            last = time.monotonic()
+            output.update(f"solving {source.name}: {text}")
+
+    return show
+
+
+def described(task: Task, found: Solution, gap: float | None, value: float) -> dict[str, Any]:
+    """The model, what was asked for (`gap`), and what was found: what all ways have in common."""
+    return {
+        "model": task.model.name,
+        "observability": task.model.observability,
+        "discount": str(task.model.discount),
+        "horizon": task.model.horizon,
+        "states": task.model.states,
+        "reachable_states": None,
+        "actions": len(task.model.actions),
+        "observations": None,
+        "blocks": None,
+        "solver": task.solver,
+        "method": found.method,
+        "gap_wanted": gap,
+        "lower": found.lower,
+        "upper": found.upper,
+        "value": value,
+        "gap": found.gap,
+        "status": found.status,
+        "guarantee": found.guarantee.text,
+        "guarantee_kind": found.guarantee.kind,
+        "note": found.note,
+        "vectors": None,
+        "iterations": found.iterations,
+        "seed": task.seed,
+        "seconds": found.seconds,
+        "build_seconds": 0.0,
+    }
+
+
+def conclude(
+    data: dict[str, Any],
+    save: Callable[[Any, str], None],
+    source: Source,
+    arguments: argparse.Namespace,
+    output: Output,
+    printed: Print,
+) -> int:
+    """Write the policy, by `save` of what is kept and the path; tell what was found; the exit status."""
+    if arguments.output is not None:
+        save(finite({k: v for k, v in data.items() if not k.endswith("seconds")}), arguments.output)
+    data["parse_seconds"] = source.parse_seconds
+    data["total_seconds"] = time.perf_counter() - arguments.began
+    data["peak_memory_bytes"] = peak_memory_bytes()
+    data["warnings"] = [str(warning) for warning in source.warnings]
+    if arguments.json:
+        output.result(data)
+    else:
+        printed(data, arguments, output)
+    return EXIT.get(data["status"], 0)
+
+
+def note_policy(arguments: argparse.Namespace, output: Output) -> None:
+    """Where the policy is, or how to keep it."""
+    if arguments.output is None:
+        output.note("-o FILE keeps the policy, and factored-polca simulate FILE runs it")
+    else:
+        output.note(
+            f"policy written to {arguments.output}; try: factored-polca simulate {arguments.output}"
+        )
 
 
 def print_solution(data: Mapping[str, Any], arguments: argparse.Namespace, output: Output) -> None:
@@ -40,12 +153,7 @@ def print_solution(data: Mapping[str, Any], arguments: argparse.Namespace, outpu
     output.line(f"guarantee: {escape(data['guarantee'])}")
     if data["note"]:
         output.line(f"note: {escape(data['note'])}")
-    if arguments.output is None:
-        output.note("-o FILE keeps the policy, and factored-polca simulate FILE runs it")
-    else:
-        output.note(
-            f"policy written to {arguments.output}; try: factored-polca simulate {arguments.output}"
-        )
+    note_policy(arguments, output)
 
 
 def value_text(data: Mapping[str, Any]) -> str:

@@ -5,21 +5,25 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from factored_polca.cli.commands import compile_kernels, limits
-from factored_polca.cli.memory import peak_memory_bytes
-from factored_polca.cli.output import Output, big, escape, finite, make_table, seconds
-from factored_polca.cli.solve_report import status_text, value_text
+from factored_polca.cli.output import Output, big, escape, make_table, seconds
+from factored_polca.cli.solve_report import (
+    conclude,
+    described,
+    note_policy,
+    shown,
+    status_text,
+    value_text,
+)
 from factored_polca.cli.source import Source, UsageError
 
 if TYPE_CHECKING:
     from factored_polca.cli.solve import Task
-    from factored_polca.structured.pomdp_solution import SymbolicSolution
 
 SYMBOLIC: Final = "symbolic"
-QUIET_SECONDS: Final = 0.1
-"""Least time between two progress messages."""
 
 
 def refuse(source: Source, task: Task) -> None:
@@ -63,58 +67,15 @@ def solve_on_diagrams(
     with source.located(), output.progress(f"compiling {source.name}"):
         symbolic = compile_model(task.model, memory_limit=limits(arguments)[0])
     build_seconds = time.perf_counter() - began
-    last = 0.0
+    show = shown(source, output)
 
     def progress(lower: float, upper: float) -> None:
-        nonlocal last
-        if time.monotonic() - last >= QUIET_SECONDS:
-            last = time.monotonic()
-            text = f"the value lies in {lower:.6g} .. {upper:.6g}, gap {upper - lower:.3g}"
-            output.update(f"solving {source.name}: {text}")
+        show(f"the value lies in {lower:.6g} .. {upper:.6g}, gap {upper - lower:.3g}")
 
     gap = 1e-3 if task.gap is None else task.gap
     with output.progress(f"solving {source.name} on diagrams"):
         found = solve_symbolic(symbolic, task.demand(gap, progress))
-    data = described(task, found, gap, reason) | {
-        "compile_seconds": compile_seconds,
-        "build_seconds": build_seconds,
-        "parse_seconds": source.parse_seconds,
-    }
-    if arguments.output is not None:
-        kept = {name: item for name, item in data.items() if not name.endswith("seconds")}
-        save_alpha_policy(found.policy, arguments.output, finite(kept))
-    data["total_seconds"] = time.perf_counter() - arguments.began
-    data["peak_memory_bytes"] = peak_memory_bytes()
-    data["warnings"] = [str(warning) for warning in source.warnings]
-    if arguments.json:
-        output.result(data)
-    else:
-        print_found(data, arguments, output)
-    return {"interrupted": 130, "memory limit": 3}.get(found.status, 0)
-
-
-def described(task: Task, found: SymbolicSolution, gap: float, reason: str) -> dict[str, Any]:
-    """What was found, in numbers and words."""
-    return {
-        "model": task.model.name,
-        "observability": task.model.observability,
-        "discount": str(task.model.discount),
-        "horizon": None,
-        "states": task.model.states,
-        "reachable_states": None,  # no state is listed
-        "actions": len(task.model.actions),
-        "observations": None,
-        "blocks": None,
-        "solver": task.solver,
-        "method": found.method,
-        "gap_wanted": gap,
-        "lower": found.lower,
-        "upper": found.upper,
-        "value": found.lower,
-        "gap": found.gap,
-        "status": found.status,
-        "guarantee": found.guarantee.text,
-        "guarantee_kind": found.guarantee.kind,
+    data = described(task, found, gap, found.lower) | {
         "note": "; ".join(part for part in (reason, found.note) if part),
         "vectors": found.vectors,
         "nodes": found.policy.nodes,
@@ -122,13 +83,17 @@ def described(task: Task, found: SymbolicSolution, gap: float, reason: str) -> d
         "seen": found.seen,
         "backups": found.backups,
         "projections": found.projections,
-        "iterations": found.iterations,
-        "seed": task.seed,
-        "seconds": found.seconds,
+        "compile_seconds": compile_seconds,
+        "build_seconds": build_seconds,
     }
 
+    def save(kept: dict[str, Any], path: str) -> None:
+        save_alpha_policy(found.policy, path, kept)
 
-def print_found(data: dict[str, Any], arguments: argparse.Namespace, output: Output) -> None:
+    return conclude(data, save, source, arguments, output, print_found)
+
+
+def print_found(data: Mapping[str, Any], arguments: argparse.Namespace, output: Output) -> None:
     """The figures for people."""
     table = make_table(f"{data['model']}, solved", {"": "left", " ": "right"})
     table.show_header = False
@@ -149,9 +114,4 @@ def print_found(data: dict[str, Any], arguments: argparse.Namespace, output: Out
     output.line(f"note: {escape(data['note'])}")
     if not math.isfinite(data["gap"]):
         return
-    if arguments.output is None:
-        output.note("-o FILE keeps the policy, and factored-polca simulate FILE runs it")
-    else:
-        output.note(
-            f"policy written to {arguments.output}; try: factored-polca simulate {arguments.output}"
-        )
+    note_policy(arguments, output)
