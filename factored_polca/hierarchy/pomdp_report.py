@@ -34,6 +34,7 @@ def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) ->
         "model": plan.model.name,
         "states": plan.model.states,
         "method": "PolCA+",
+        "status": plan.status,
         "discount": float(plan.model.discount),
         "flat_upper": plan.flat.upper,
         "flat_blocks": plan.flat.blocks,

@@ -105,6 +105,7 @@ def run_on_blocks(
     steps: int | None = None,
     seed: int = 0,
     stage: Stage | None = None,
+    progress: Progress | None = None,
 ) -> BeliefRuns:
     """Run a policy over beliefs on the original model.
 
@@ -122,6 +123,7 @@ def run_on_blocks(
         steps=steps,
         seed=seed,
         at_once=max(1, BELIEF_NUMBERS // tracker.partition.blocks),
+        progress=progress,
     )
 
 
