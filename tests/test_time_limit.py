@@ -17,10 +17,14 @@ from random_models import random_model
 
 from factored_polca import library
 from factored_polca.cli import main
+from factored_polca.control.belief_controller import plan_tracker
+from factored_polca.control.belief_policies import PolledPolicy
+from factored_polca.control.block_tracker import BlockTracker
 from factored_polca.hierarchy import Options, plan_mdp, plan_pomdp
 from factored_polca.hierarchy.pomdp_executable import executable_pomdp
 from factored_polca.hierarchy.time_limit import plan_status, search_deadline
 from factored_polca.models import LimitReached, Task, TaskHierarchy
+from factored_polca.simulation.belief_runs import run_on_blocks
 from factored_polca.simulation.measure import measure
 
 plan_module = import_module("factored_polca.hierarchy.plan")  # a function has its name
@@ -134,3 +138,22 @@ def test_what_is_not_measured_in_time_is_left_out(
     assert "not measured: time was up" in capsys.readouterr().out
     assert main(["plan", "meds", "--json", "-o", "meds.plan"]) == 0
     assert json.loads(capsys.readouterr().out)["value"] is None
+
+
+def test_episodes_that_time_ends_are_those_of_as_many_steps() -> None:
+    domain = library.load("meds")
+    policy = executable_pomdp(plan_pomdp(domain.model, domain.tasks))
+    tracker = plan_tracker(policy).tracker
+    assert isinstance(tracker, BlockTracker)
+    polled = PolledPolicy(policy, tracker)
+
+    def stop(first: int, step: int) -> None:
+        if step == 5:
+            raise LimitReached("the time limit was reached", "measure")
+
+    whole = run_on_blocks(tracker, polled, episodes=30, steps=5)
+    ended = run_on_blocks(tracker, polled, episodes=30, steps=50, progress=stop)
+    assert ended.steps == 5
+    assert ended.returns.tolist() == whole.returns.tolist()
+    assert ended.cumulative.tolist() == whole.cumulative.tolist()
+    assert ended.truncation == whole.truncation > 0

@@ -301,6 +301,13 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     output.line(f"guarantee: {escape(data['guarantee'])}")
 
 
+def longer(data: dict[str, Any]) -> str:
+    """What longer episodes could change, where time has made them shorter than they would have been."""
+    if data["truncation"] <= max(data["standard_error"], 1e-6 * abs(data["value"])):
+        return ""
+    return f"; longer ones may change it by {data['truncation']:.2g}"
+
+
 def cut_column(data: dict[str, Any]) -> dict[str, Literal["left"]]:
     """The column that tells how searches ended, where a limit cut one short."""
     return {} if data["status"] == "complete" else {"status": "left"}
@@ -360,7 +367,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         output.line(
             f"the hierarchical policy earns [bold]{data['value']:.6g}[/] ± {data['standard_error']:.2g} "
             f"from the start (mean and standard error, {data['episodes']:,} episodes of {data['steps']:,} "
-            "steps)"
+            f"steps{longer(data)})"
         )
     if data["flat_upper"] is None:
         output.line(f"bound on all policies: {escape(data['flat_note'])}")
