@@ -162,6 +162,7 @@ def plan_partial(
     compile_seconds: float,
 ) -> dict[str, Any]:
     """PolCA+: the figures of the plan, measured, which is written where that is asked for."""
+    from factored_polca.control.certify import certify
     from factored_polca.hierarchy import plan_pomdp
     from factored_polca.hierarchy.merging import merging_report
     from factored_polca.hierarchy.pomdp_executable import executable_pomdp
@@ -193,6 +194,8 @@ def plan_partial(
             ),
             deadline=deadline,
         )
+        output.update(f"certifying {source.name}")
+        found = replace(found, certified=certify(found, policy, deadline=deadline, seed=arguments.seed))
     data = pomdp_plan_report(found, polca) | tried | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:
@@ -373,9 +376,19 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         output.line(f"bound on all policies: {escape(data['flat_note'])}")
     else:
         output.line(f"no policy earns more than {data['flat_upper']:.6g} ({escape(data['flat_note'])})")
+    print_certified(data["certified"], output)
     output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
     print_merging(data, output)
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def print_certified(certified: dict[str, Any], output: Output) -> None:
+    """What the hierarchical policy surely earns."""
+    low, high, note = certified["polled_lower"], certified["polled_upper"], escape(certified["note"])
+    if low is None:
+        output.line(f"certified: {note}")
+    else:
+        output.line(f"certified: the hierarchical policy earns {brief(low)} .. {brief(high)} ({note})")
 
 
 def brief(value: float) -> str:

@@ -40,7 +40,8 @@ from factored_polca.symbolic import NumericView, SymbolicModel
 
 @dataclass(frozen=True)
 class CertifiedBounds:
-    """What is certain of a plan whose tasks were merged approximately, under the model's reward.
+    """What is certain of a plan under the model's reward: of one whose tasks were merged approximately, or
+    whose state is not seen.
 
     `polled_lower` <= what the polled policy earns <= `polled_upper`, what any policy earns <=
     `optimum_upper`; None where a bound was left out, and `note` says why.
@@ -261,11 +262,12 @@ def approximation_report(found: Approximation | None) -> dict[str, Any]:
 
 
 def merging_report(root: Approximation | None, certified: CertifiedBounds | None) -> dict[str, Any]:
-    """What is certain of a whole plan, as plain data; nothing for an exact abstraction."""
-    if root is None or certified is None:
+    """What is certain of a whole plan, as plain data, and how near its merged states are."""
+    if certified is None:
         return {}
+    merged = {} if root is None else {"merge_within": root.epsilon_text}
     return {
-        "merge_within": root.epsilon_text,
+        **merged,
         "certified": {
             "polled_lower": certified.polled_lower,
             "polled_upper": certified.polled_upper,

@@ -78,7 +78,8 @@ class FlatBound:
 class PomdpPlan(DrawnGraph, Framed):
     """A hierarchy solved under partial observability; `solved` lists the tasks children first.
 
-    Where near states were merged, `certified` bounds the optimum without an exact quotient.
+    Where near states were merged, `certified` bounds the optimum without an exact quotient;
+    `factored_polca.control.certify.certify` bounds what the polled policy earns too.
     """
 
     symbolic: SymbolicModel

@@ -104,8 +104,9 @@ def guarantee(plan: PomdpPlan) -> str:
     chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
     if plan.root.approximation is not None:
         return merging_text(plan.root.approximation, plan.certified)
+    certified = plan.certified is not None and plan.certified.polled_lower is not None
     return (
         "each task's bounds hold in its own model, given what its children do where they are certain; what "
-        "the polled policy earns is measured; each partition exact but for a chance below "
-        f"{max(chance, 1e-300):.1g}"
+        f"the polled policy earns is measured{' and certified' if certified else ''}; each partition exact "
+        f"but for a chance below {max(chance, 1e-300):.1g}"
     )
