@@ -105,6 +105,6 @@ def ends_with_the_model(found: PomdpPlan) -> bool:
 
 def upper_bound(found: PomdpPlan) -> float | None:
     """What no policy can exceed, where it is known of the model itself."""
-    if found.certified is not None and found.certified.optimum_upper is not None:
-        return found.certified.optimum_upper if ends_with_the_model(found) else None
-    return found.flat.upper if ends_with_the_model(found) else None
+    merged = None if found.certified is None else found.certified.optimum_upper
+    known = [bound for bound in (merged, found.flat.upper) if bound is not None]
+    return min(known) if known and ends_with_the_model(found) else None

@@ -85,7 +85,7 @@ def measure(
     for name, task in reversed(list(plan.policies.items())):  # the root first
         if name != plan.root and not any(action in plan.policies for action in task.actions):
             continue
-        stage = None if name == plan.root else Stage(task.ended, plan.process(name).rewards)
+        stage = None if name == plan.root else Stage(task.ended, plan.rewards(name))
         count = root_episodes if name == plan.root or child_episodes is None else child_episodes
         with suppress(LimitReached):
             runs[name] = run_on_blocks(
