@@ -26,6 +26,7 @@ from factored_polca.approximation.approximate import (
     certify_mdp,
     certify_pomdp,
 )
+from factored_polca.approximation.bracket import bracketed
 from factored_polca.approximation.snap import Snapped, as_epsilon, snap
 from factored_polca.diagrams import FLOAT, Aborted, Diagram, MemoryLimit, choose, leaves
 from factored_polca.hierarchy.evaluation import Evaluation
@@ -126,15 +127,26 @@ class Merging:
         return replace(found, measured_loss=loss, measured_note="the exact quotients, solved")
 
     def certify_pomdp(self, reduction: Reduction, solution: POMDPSolution) -> Approximation:
-        """What is certain of a task's policy where the state is not seen.
+        """What is certain of a task's policy where the state is not seen: by the simulation lemma, and where
+        the task itself has few enough blocks by solving and following it.
 
         Raises:
             LimitReached: memory or time.
         """
         assert isinstance(reduction, ApproximateReduction)
+        options = self.options
         with limits_named():
             found = certify_pomdp(reduction, solution)
-        return replace(found, measured_note="the plan's episodes tell")
+        found = replace(found, measured_note="the plan's episodes tell")
+        if options.flat_block_limit is None:
+            return found
+        try:
+            return bracketed(
+                reduction, solution, found, block_limit=options.flat_block_limit,
+                deadline=options.deadline, seed=options.seed,
+            )  # fmt: skip
+        except (LimitReached, MemoryLimit, Aborted) as error:
+            return replace(found, note=f"{found.note}; no bracket: {error}")
 
     def bounds(self, chain: DecisionProcess, flat: DecisionProcess) -> CertifiedBounds:
         """Certified bounds on the value of `chain`, which has one choice, and on the optimum of `flat`."""

@@ -94,8 +94,11 @@ def bound_policy(
     *,
     beliefs: int = BELIEFS,
     deadline: float | None = None,
+    floor: Callable[[FloatArray], FloatArray] | None = None,
 ) -> PolicyBounds:
     """Bounds on the value of a policy at b0, following up to `beliefs` beliefs, until `deadline`.
+
+    `floor` says what the policy itself earns at least [n] at beliefs [n, s], where something is known.
 
     Raises:
         ModelError: discount 1, or the policy has no action at a belief that it meets.
@@ -104,7 +107,7 @@ def bound_policy(
     began = time.perf_counter()
     if not pomdp.discount < 1:
         raise ModelError("bounds of a policy over beliefs need a discount below 1")
-    graph = _Graph(pomdp, choose, Demand(deadline=deadline))
+    graph = _Graph(pomdp, choose, Demand(deadline=deadline), floor)
     graph.start()
     graph.follow(beliefs)
     lower, upper = graph.value(-1), graph.value(1)
@@ -116,7 +119,13 @@ def bound_policy(
 class _Graph:
     """The beliefs met so far (a working state); lists are by the number of a belief."""
 
-    def __init__(self, pomdp: ArrayPOMDP, choose: Choose, demand: Demand) -> None:
+    def __init__(
+        self,
+        pomdp: ArrayPOMDP,
+        choose: Choose,
+        demand: Demand,
+        floor: Callable[[FloatArray], FloatArray] | None,
+    ) -> None:
         self.pomdp, self.choose, self.demand = pomdp, choose, demand
         self.live = ~pomdp.terminal
         self.states: list[IntArray] = []
@@ -132,7 +141,12 @@ class _Graph:
         self.merged, self.waiting = 0.0, 0.0
         most = _best(pomdp, demand)
         least = _best(replace(pomdp, rewards=-pomdp.rewards), demand)
-        self.low: Callable[[FloatArray], FloatArray] = lambda beliefs: -least.values(beliefs)
+
+        def low(beliefs: FloatArray) -> FloatArray:
+            known = -least.values(beliefs)
+            return known if floor is None else np.maximum(known, floor(beliefs))
+
+        self.low = low
         self.high: Callable[[FloatArray], FloatArray] = most.values
         rewards = pomdp.rewards
         self.span = float(rewards.max(initial=0.0) - rewards.min(initial=0.0)) / (1 - pomdp.discount)
