@@ -24,6 +24,7 @@ from factored_polca.approximation.approximate import (
     certify_mdp,
     certify_pomdp,
 )
+from factored_polca.approximation.bracket import bracketed
 from factored_polca.approximation.certificate import certify_policy
 from factored_polca.approximation.representatives import Representatives, cover, distance
 from factored_polca.approximation.snap import as_epsilon, drop_parents, snap
@@ -411,9 +412,13 @@ def test_the_bounds_of_random_pomdps_hold(seed: int) -> None:
     low, high = followed(pomdp, block, found.partition.blocks, solution.policy, 12)
     optimum_low, optimum_high = bracket(pomdp, pomdp.initial[None, :], most=MOST_BELIEFS)
     slack = 1e-8 * max(1.0, float(np.abs(pomdp.rewards).max()))
-    assert certain.lower <= high + slack
-    assert float(optimum_low[0]) <= certain.optimum + slack
-    assert float(optimum_low[0]) - high <= certain.loss + slack
+    tighter = bracketed(found, solution, certain, block_limit=100, beliefs=20, trials=5)
+    assert tighter.loss <= certain.loss
+    for bounds in (certain, tighter):
+        assert bounds.lower <= high + slack
+        assert low <= bounds.upper + slack
+        assert float(optimum_low[0]) <= bounds.optimum + slack
+        assert float(optimum_low[0]) - high <= bounds.loss + slack
     assert low <= float(optimum_high[0]) + slack  # the oracle agrees with itself
 
 

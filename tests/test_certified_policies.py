@@ -20,6 +20,7 @@ from tree_brackets import random_pomdp as random_arrays
 from tree_brackets import tiger
 
 from factored_polca import library
+from factored_polca.approximation.defects import overestimate
 from factored_polca.cli import main
 from factored_polca.control.certify import certify, polled_bounds
 from factored_polca.explicit.alpha_vectors import AlphaSet, AlphaVectors
@@ -30,6 +31,8 @@ from factored_polca.models import ModelError
 from factored_polca.models.model import replace_fields
 from factored_polca.simulation.measure import measure
 from factored_polca.solvers.policy_bounds import PolicyBounds, bound_policy
+from factored_polca.solvers.pomdp_choose import solve_pomdp
+from factored_polca.solvers.pomdp_result import Demand
 
 SEEDS = range(70)
 MOST = 500
@@ -172,10 +175,8 @@ def random_policy(seed: int, pomdp: ArrayPOMDP) -> AlphaVectors:
     return AlphaVectors(pomdp.states, tuple(part for part in sets if len(part.states)))
 
 
-@pytest.mark.parametrize("seed", range(40))
-def test_any_policy_is_worth_what_its_bounds_say(seed: int) -> None:
-    pomdp = random_arrays(seed, discount=0.6)
-    policy = random_policy(seed, pomdp)
+def by_enumeration(pomdp: ArrayPOMDP, policy: AlphaVectors) -> tuple[float, float]:
+    """Bounds on what a policy earns, all its beliefs being followed."""
     labels = np.unique(pomdp.observed)
 
     def split(beliefs: list[tuple[np.ndarray, float]]) -> list[tuple[np.ndarray, float]]:
@@ -191,14 +192,51 @@ def test_any_policy_is_worth_what_its_bounds_say(seed: int) -> None:
     for a, row in enumerate(pomdp.kernel):
         for o, matrix in enumerate(row):
             kernel[a, o] = matrix.toarray()
-    low, high = followed(
-        lambda b: policy.action(b), kernel, pomdp.rewards, pomdp.initial, split, pomdp.discount, 30
-    )
+    return followed(policy.action, kernel, pomdp.rewards, pomdp.initial, split, pomdp.discount, 30)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_any_policy_is_worth_what_its_bounds_say(seed: int) -> None:
+    pomdp = random_arrays(seed, discount=0.6)
+    policy = random_policy(seed, pomdp)
+    low, high = by_enumeration(pomdp, policy)
     slack = 1e-9 * max(1.0, float(np.abs(pomdp.rewards).max()))
     for beliefs in (0, 1, 10, 400):
         found = bound_policy(pomdp, policy.choose, beliefs=beliefs)
         assert found.lower <= high + slack
         assert low <= found.upper + slack
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_what_vectors_promise_is_at_most_so_much_too_much(seed: int) -> None:
+    """Vectors of a solver, in another process than the one that they were found in, and of no solver."""
+    pomdp = random_arrays(seed, discount=0.6)
+    policy = random_policy(seed, pomdp)
+    if seed % 2:
+        other = random_arrays(seed, discount=0.5)
+        solved = solve_pomdp(other, "sarsop", demand=Demand(gap=1e-3, iterations=10)).policy
+        assert isinstance(solved, AlphaVectors)
+        policy = solved  # which may lack states that were not reached
+    if seed % 5 == 0:
+        policy = AlphaVectors(pomdp.states, policy.sets[:-1])
+    less = overestimate(pomdp, policy, np.arange(pomdp.states), lambda: None)
+    assert less is not None
+    _, high = by_enumeration(pomdp, policy)
+    slack = 1e-9 * max(1.0, float(np.abs(pomdp.rewards).max()))
+    live = np.where(pomdp.terminal, 0.0, pomdp.initial)
+    parts = [np.where(pomdp.observed == y, live, 0.0) for y in np.unique(pomdp.observed)]
+    for e in less:
+        promised = sum(policy.value(part) - float(part @ e) for part in parts)
+        assert promised <= high + slack
+
+
+def test_vectors_of_a_solver_promise_little_too_much_in_their_own_process() -> None:
+    pomdp = tiger(0.95)
+    solved = solve_pomdp(pomdp, "sarsop", demand=Demand(gap=1e-3)).policy
+    assert isinstance(solved, AlphaVectors)
+    less = overestimate(pomdp, solved, np.arange(2), lambda: None)
+    assert less is not None
+    assert float(less.max(axis=1).min()) <= 5  # rewards are from -100 to 10, the lemma knows only these
 
 
 def test_a_cycle_of_beliefs_is_solved_exactly() -> None:

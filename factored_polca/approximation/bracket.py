@@ -4,8 +4,9 @@ The simulation lemma (`lemma`) takes the worst for granted at each step.  Where 
 enough blocks, its quotient brackets the loss from both sides, as a check of the lemma and in its place:
 
     below   the policy of the snapped process is followed through the beliefs of the process itself
-            (`factored_polca.solvers.policy_bounds`); at a belief b that is left it earns at least what the
-            lemma says there,  max of alpha . b - b . e;
+            (`factored_polca.solvers.policy_bounds`); at a belief b that is left it earns at least
+            max of alpha . b - b . e,  with e by the lemma or by what its vectors promise too much in the
+            process itself (`defects`);
     above   the process itself is searched for a while, and the upper bound taken.
 
 Each is at least as good as the lemma's; the loss is at most their difference.
@@ -13,6 +14,7 @@ Each is at least as good as the lemma's; the loss is at most their difference.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -20,10 +22,12 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from factored_polca.approximation.approximate import ApproximateReduction, Approximation
+from factored_polca.approximation.defects import overestimate
 from factored_polca.approximation.lemma import block_errors, entry_span
 from factored_polca.explicit.alpha_vectors import AlphaVectors, StagedVectors
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.explicit.policy_graph import PolicyGraph
+from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.minimisation import make_pomdp_quotient, minimise
 from factored_polca.minimisation.quotient import feature_states
 from factored_polca.solvers.policy_bounds import bound_policy
@@ -48,7 +52,7 @@ def bracketed(
     deadline: float | None = None,
     seed: int = 0,
 ) -> Approximation:
-    """`found`, which the lemma says of a solution of the snapped process, and the bracket: the best of both.
+    """`found`, which the lemma says of a solution of the snapped process, or the bracket where better.
 
     Raises:
         LimitReached: the process itself has more than `block_limit` blocks or too many observations; time.
@@ -69,14 +73,9 @@ def bracketed(
     def choose(beliefs: FloatArray) -> IntArray:
         return policy.choose(np.asarray(beliefs @ onto))
 
-    less, floor = errors_below(reduction, solution), None
-    if less is not None:
-        assert isinstance(policy, AlphaVectors)
-
-        def floor(beliefs: FloatArray) -> FloatArray:
-            over = np.asarray(beliefs @ onto)
-            return np.asarray(policy.values(over) - over @ less, dtype=np.float64)
-
+    floor = None
+    if isinstance(policy, AlphaVectors):
+        floor = lower_values(reduction, solution, policy, pomdp, onto)
     followed = bound_policy(pomdp, choose, beliefs=beliefs, deadline=deadline, floor=floor)
     searched = solve_pomdp(
         pomdp, "sarsop", demand=Demand(gap=1e-9, iterations=trials, deadline=deadline, seed=seed)
@@ -94,8 +93,35 @@ def bracketed(
     )  # fmt: skip
 
 
+def lower_values(
+    reduction: ApproximateReduction,
+    solution: POMDPSolution,
+    policy: AlphaVectors,
+    pomdp: ArrayPOMDP,
+    onto: csr_array,
+) -> Callable[[FloatArray], FloatArray] | None:
+    """What the policy of a solution earns at least in `pomdp` [n] at its beliefs [n, s]; None: not known.
+
+    `onto` [s, block] is 1 where a state lies in a block.
+    """
+    block = np.asarray(onto.indices, dtype=np.int64)
+    of_blocks = errors_below(reduction, solution)
+    errors = [] if of_blocks is None else [np.asarray(onto @ of_blocks)]
+    more = overestimate(pomdp, policy, block, reduction.original.symbolic.manager.pause)
+    errors += [] if more is None else [*more]
+    if not errors:
+        return None
+    less = np.stack(errors)
+
+    def values(beliefs: FloatArray) -> FloatArray:
+        found: FloatArray = policy.values(np.asarray(beliefs @ onto)) - (beliefs @ less.T).min(axis=1)
+        return found
+
+    return values
+
+
 def errors_below(reduction: ApproximateReduction, solution: POMDPSolution) -> FloatArray | None:
-    """By how much less than its value function the policy may earn [block]; None: its vectors prove nothing.
+    """By how much less than its value function the policy may earn [block]; None: not known.
 
     What the solver's bound at b0 is less than its vectors say there is rounding, and taken off too.
     """

@@ -127,8 +127,8 @@ class Merging:
         return replace(found, measured_loss=loss, measured_note="the exact quotients, solved")
 
     def certify_pomdp(self, reduction: Reduction, solution: POMDPSolution) -> Approximation:
-        """What is certain of a task's policy where the state is not seen: by the simulation lemma, and where
-        the task itself has few enough blocks by solving and following it.
+        """What is certain of a task's policy where the state is not seen: by the simulation lemma, and by
+        solving and following the task itself where it has few enough blocks.
 
         Raises:
             LimitReached: memory or time.
