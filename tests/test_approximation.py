@@ -50,7 +50,7 @@ ORACLE = 1e-9
 EPSILONS = ("0.02", "0.1", "0.3")
 SEEDS = range(100)
 
-MOST_BELIEFS = 2_000
+MOST_BELIEFS = 1_000
 
 PURPOSELESS = (36,)
 
@@ -175,6 +175,11 @@ def test_snapped_rows_and_rewards_stay_within_epsilon(seed: int, partial: bool) 
             assert all(abs(old.values[i] - new.values[j]) <= radius for i, j in zip(a, b, strict=True))
 
 
+def nearby(model: Model, seed: int) -> Model:
+    """The model with a discount up to 0.9, but one in ten as it is: iterating far takes the oracle long."""
+    return model if seed % 10 == 0 else replace_fields(model, discount=min(model.discount, Fraction(9, 10)))
+
+
 # -- policies of fully observed models against all states ------------------------------------------
 
 
@@ -193,7 +198,7 @@ def worth(initial: np.ndarray, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
-    model = random_model(seed, max_states=96)
+    model = nearby(random_model(seed, max_states=40), seed)
     epsilon = EPSILONS[seed % 3]
     symbolic = compile_model(model)
     process = flat_process(symbolic)
@@ -310,7 +315,7 @@ def test_nothing_is_lost_where_there_is_nothing_to_choose() -> None:
 
 @pytest.mark.parametrize("seed", range(0, 60, 2))
 def test_the_bounds_of_random_hierarchies_hold(seed: int) -> None:
-    model = random_model(seed, max_states=64)
+    model = nearby(random_model(seed, max_states=64), seed)
     tasks = random_tasks(seed, model)
     options = Options(merge_within=EPSILONS[seed // 2 % 3], flat_block_limit=1000, seed=seed)
     if seed in PURPOSELESS:  # with other policies of its children the root earns one constant
