@@ -213,7 +213,7 @@ def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
     earned = worth(initial, dynamic_programming.evaluate_policy(arrays, taken.tolist()))
     slack = ORACLE * max(1.0, abs(best))
     one_step = certify_mdp(found, solution.policy, steps=1, seed=seed)
-    further = certify_mdp(found, solution.policy, seed=seed)
+    further = certify_mdp(found, solution.policy, steps=10, seed=seed)
     by_errors = certify_mdp(found, solution.policy, class_limit=0, seed=seed)
     assert by_errors.classes is None
     assert further.classes is not None
@@ -222,7 +222,7 @@ def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
         assert best <= certain.optimum + slack
         assert best - earned <= certain.loss + slack
     assert abs(best - earned) <= 2 * one_step.model_error + (slack if found.stable else np.inf)
-    assert bounded_optimum(found, seed=seed) >= best - slack
+    assert bounded_optimum(found, steps=10, seed=seed) >= best - slack
     assert found.partition.blocks <= reduce(process).partition.blocks
 
 
@@ -231,7 +231,7 @@ def test_bounds_of_a_coarse_partition_and_a_bad_policy_hold(seed: int) -> None:
     """Any partition that respects the masks, any policy on it: here the masks alone, choices at random."""
     from factored_polca.approximation.aggregate import masks
 
-    model = random_model(seed, max_states=96)
+    model = random_model(seed, max_states=48)
     symbolic = compile_model(model)
     process, exact = flat_process(symbolic), enumerate_model(model)
     arrays, states = exact.to_arrays(), state_numbers(model, exact)
@@ -313,7 +313,7 @@ def test_nothing_is_lost_where_there_is_nothing_to_choose() -> None:
 # -- hierarchies -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(0, 60, 2))
+@pytest.mark.parametrize("seed", range(0, 60, 4))
 def test_the_bounds_of_random_hierarchies_hold(seed: int) -> None:
     model = nearby(random_model(seed, max_states=64), seed)
     tasks = random_tasks(seed, model)

@@ -26,6 +26,7 @@ from factored_polca.hierarchy.time_limit import plan_status, search_deadline
 from factored_polca.models import LimitReached, Task, TaskHierarchy
 from factored_polca.simulation.belief_runs import run_on_blocks
 from factored_polca.simulation.measure import measure
+from factored_polca.symbolic import compile_model
 
 plan_module = import_module("factored_polca.hierarchy.plan")  # a function has its name
 pomdp_plan_module = import_module("factored_polca.hierarchy.pomdp_plan")
@@ -157,3 +158,26 @@ def test_episodes_that_time_ends_are_those_of_as_many_steps() -> None:
     assert ended.returns.tolist() == whole.returns.tolist()
     assert ended.cumulative.tolist() == whole.cumulative.tolist()
     assert ended.truncation == whole.truncation > 0
+
+
+@pytest.mark.parametrize("name", ["meds", "taxi"])
+def test_a_root_whose_search_ends_late_still_makes_a_plan(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    domain = library.load(name)
+    symbolic = compile_model(domain.model, tasks=domain.tasks)
+
+    def late(options: Options, *, is_root: bool) -> float | None:
+        if is_root:  # from now on diagrams may not be worked on
+            symbolic.manager.deadline = LONG_AGO
+        return None
+
+    for module in (plan_module, pomdp_plan_module):
+        monkeypatch.setattr(module, "search_deadline", late)
+    work = plan_pomdp if name == "meds" else plan_mdp
+    found = work(domain.model, domain.tasks, symbolic=symbolic)
+    assert found.root.lower <= found.root.upper if name == "meds" else found.polled.lower <= 3.8573860
+    assert "left out" in (found.flat.note if name == "meds" else found.flat_note)
+    if name == "taxi":  # the flat optimum, 3.85738595, is what this hierarchy earns (`test_solve_command`)
+        assert found.polled.upper >= 3.8573859
+        assert "the root's bounds" in found.polled.guarantee.text

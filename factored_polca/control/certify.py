@@ -11,6 +11,8 @@ than the flat bound.
 
 from __future__ import annotations
 
+import math
+
 from factored_polca.control.belief_policies import PolledPolicy
 from factored_polca.control.block_tracker import BlockTracker, kept_apart
 from factored_polca.control.tracker import BLOCK_LIMIT, BYTES_PER_BLOCK, limited_memory
@@ -41,20 +43,21 @@ def certify(
         deadline: a reading of `time.monotonic()` at which following them ends.
         seed: of random elements.
     """
-    optimum, blocks = upper_bound(found), 0
+    optimum, blocks, root = upper_bound(found), 0, found.root
+    most = math.inf if optimum is None else optimum
     plan = executable_pomdp(found) if plan is None else plan
     try:
         followed, blocks = polled_bounds(
             plan, beliefs=beliefs, block_limit=block_limit, deadline=deadline, seed=seed
         )
     except (LimitReached, MemoryLimit, Aborted) as error:
-        return CertifiedBounds(None, None, optimum, f"no bounds on the polled policy: {error}")
-    low, high = followed.lower, followed.upper
-    root = found.root
+        note = f"beliefs were not followed: {error}"
+        if own_policy(found):
+            return CertifiedBounds(root.lower, min(root.upper, most), optimum, note)
+        return CertifiedBounds(None, None, optimum, note)
+    low, high = followed.lower, min(followed.upper, most)
     if own_policy(found):
         low, high = max(low, root.lower), min(high, root.upper)
-    if optimum is not None:
-        high = min(high, optimum)
     rest = f"{followed.left:,} left, worth what any policy may earn" if followed.left else "and none left"
     note = f"{followed.followed:,} beliefs over {blocks:,} blocks followed, {rest}"
     return CertifiedBounds(low, high, optimum, note, blocks)

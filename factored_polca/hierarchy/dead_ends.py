@@ -16,12 +16,13 @@ def refuse_unavoidable_dead_ends(root: AnySolvedTask) -> None:
     Raises:
         ModelError: naming such a start.
     """
-    if isinstance(root, StructuredTask):
-        state = lost_start(root.solution)
-    else:
-        belief = root.reduction.project_initial()
-        lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
-        state = describe_block(root.reduction, int(lost[0])) if len(lost) else None
+    with root.process.symbolic.manager.undisturbed():  # it may be late, and is soon done
+        if isinstance(root, StructuredTask):
+            state = lost_start(root.solution)
+        else:
+            belief = root.reduction.project_initial()
+            lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
+            state = describe_block(root.reduction, int(lost[0])) if len(lost) else None
     if state is not None:
         message = (
             f"from a start state like {state} every policy of task {root.task.name!r} can run into a state "

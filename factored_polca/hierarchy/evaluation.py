@@ -55,7 +55,8 @@ def root_bounds(root: AnySolvedTask, reason: str) -> Evaluation:
     if isinstance(root, StructuredTask):
         low, high = root.solution.policy_lower, root.solution.upper
     else:
-        belief, solution = root.reduction.project_initial(), root.solution
+        with root.process.symbolic.manager.undisturbed():
+            belief, solution = root.reduction.project_initial(), root.solution
         low = expectation(belief, solution.lower) - solution.policy_loss_bound
         high = expectation(belief, solution.upper)
     text = f"the root's bounds, as the chain of the polled policy was not solved: {reason}"

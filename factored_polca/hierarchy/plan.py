@@ -316,15 +316,16 @@ class _Planner:
             refuse_without_purpose(task, reduction.mdp)
         until = search_deadline(self.options, is_root=task in self.hierarchy.roots())
         solution = self.optimise(task.name, reduction, method, custom, search_until=until)
-        if isinstance(reduction, InterchangeableReduction):
-            counts = count_exchanged(reduction.exchanged)
-        else:
-            counts = count_q_values(process, reduction.partition, self.options.seed)
-        policy = reduction.lift_policy(solution.policy)
-        chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
-        defined = relabel(reduction.partition.diagram, chosen, INDEX)
-        dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
-        value = expectation(reduction.project_initial(), solution.values)
+        with self.symbolic.manager.undisturbed():  # a search may have ended late
+            if isinstance(reduction, InterchangeableReduction):
+                counts = count_exchanged(reduction.exchanged)
+            else:
+                counts = count_q_values(process, reduction.partition, self.options.seed)
+            policy = reduction.lift_policy(solution.policy)
+            chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
+            defined = relabel(reduction.partition.diagram, chosen, INDEX)
+            dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
+            value = expectation(reduction.project_initial(), solution.values)
         approximation = None
         if self.merging is not None:
             self.tell(task.name, "certify", 0, reduction.partition.blocks)

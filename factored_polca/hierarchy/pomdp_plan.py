@@ -259,9 +259,11 @@ class _Planner:
         solution = self.optimise(task, reduction, method, is_root)
         policy = belief_policy(solution)
         corner, ties = corner_choices(policy, reduction.partition.blocks)
+        with self.symbolic.manager.undisturbed():  # a search may have ended late
+            lifted = reduction.lift_policy(corner)
         now = time.perf_counter()
         self.solved[task.name] = SolvedPomdpTask(
-            task, reduction, solution, policy, corner, reduction.lift_policy(corner),
+            task, reduction, solution, policy, corner, lifted,
             self.symbolic.manager.constant(1), ties, now - began, minimised - began,
             task_warnings(task, solution, is_child=not is_root),
             None if self.merging is None else self.merging.certify_pomdp(reduction, solution),
