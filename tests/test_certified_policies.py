@@ -22,7 +22,7 @@ from tree_brackets import tiger
 from factored_polca import library
 from factored_polca.approximation.defects import overestimate
 from factored_polca.cli import main
-from factored_polca.control.certify import certify, polled_bounds
+from factored_polca.control.certify import certify_plan, polled_bounds
 from factored_polca.explicit.alpha_vectors import AlphaSet, AlphaVectors
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
 from factored_polca.hierarchy import Options, PomdpPlan, plan_pomdp
@@ -105,7 +105,7 @@ def test_the_bounds_of_random_hierarchies_hold_the_value_by_enumeration(seed: in
         assert bounds.lower >= before[0] - slack  # following more beliefs makes no bound worse
         assert bounds.upper <= before[1] + slack
         before = bounds.lower, bounds.upper
-    certain = certify(found, plan, beliefs=5)
+    certain = certify_plan(found, plan, beliefs=5)
     assert certain.polled_lower is not None
     assert certain.polled_upper is not None
     assert certain.polled_lower <= high + slack
@@ -140,7 +140,7 @@ def test_the_bounds_of_small_plans_hold_the_value_by_enumeration(name: str) -> N
 @pytest.mark.parametrize(("name", "value"), [("tiger", 19.371368), ("cheese", 3.486207)])
 def test_flat_plans_that_close_are_certified_as_worth_the_optimum(name: str, value: float) -> None:
     found = plan_pomdp(library.load(name).model, options=Options(gap=1e-6, trials=None))
-    certain = certify(found)
+    certain = certify_plan(found)
     assert certain.polled_lower == pytest.approx(value, abs=3e-6)
     assert certain.polled_upper == pytest.approx(value, abs=3e-6)
     assert "none left" in certain.note
@@ -151,7 +151,7 @@ def test_shipped_hierarchies_earn_in_episodes_what_is_certified(name: str) -> No
     domain = library.load(name)
     found = plan_pomdp(domain.model, domain.tasks)
     plan = executable_pomdp(found)
-    certain, runs = certify(found, plan), measure(plan, episodes=300, child_episodes=1).runs[plan.root]
+    certain, runs = certify_plan(found, plan), measure(plan, episodes=300, child_episodes=1).runs[plan.root]
     assert certain.polled_lower is not None
     assert certain.polled_upper is not None
     assert certain.polled_upper - certain.polled_lower <= 1e-4
@@ -278,10 +278,10 @@ def test_what_has_no_bounds_is_refused_or_said() -> None:
     with pytest.raises(ModelError, match="no action"):
         bound_policy(pomdp, lambda beliefs: np.full(len(beliefs), -1))
     domain = library.load("meds")
-    certain = certify(plan_pomdp(domain.model, domain.tasks), block_limit=1)
+    certain = certify_plan(plan_pomdp(domain.model, domain.tasks), block_limit=1)
     assert certain.polled_lower is None
     assert "more than 1 blocks" in certain.note
-    late = certify(plan_pomdp(domain.model, domain.tasks), deadline=0.0)
+    late = certify_plan(plan_pomdp(domain.model, domain.tasks), deadline=0.0)
     assert late.polled_lower is None
     assert "time limit" in late.note
 

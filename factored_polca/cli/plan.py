@@ -162,7 +162,7 @@ def plan_partial(
     compile_seconds: float,
 ) -> dict[str, Any]:
     """PolCA+: the figures of the plan, measured, which is written where that is asked for."""
-    from factored_polca.control.certify import certify
+    from factored_polca.control.certify import certify_plan
     from factored_polca.hierarchy import plan_pomdp
     from factored_polca.hierarchy.merging import merging_report
     from factored_polca.hierarchy.pomdp_executable import executable_pomdp
@@ -195,7 +195,9 @@ def plan_partial(
             deadline=deadline,
         )
         output.update(f"certifying {source.name}")
-        found = replace(found, certified=certify(found, policy, deadline=deadline, seed=arguments.seed))
+        found = replace(
+            found, certified=certify_plan(found, policy, deadline=deadline, seed=arguments.seed)
+        )
     data = pomdp_plan_report(found, polca) | tried | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:

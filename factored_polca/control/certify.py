@@ -25,7 +25,7 @@ from factored_polca.minimisation import flat_process, minimise
 from factored_polca.models import LimitReached
 
 
-def certify(
+def certify_plan(
     found: PomdpPlan,
     plan: ExecutablePomdpPlan | None = None,
     *,

@@ -79,7 +79,7 @@ class PomdpPlan(DrawnGraph, Framed):
     """A hierarchy solved under partial observability; `solved` lists the tasks children first.
 
     Where near states were merged, `certified` bounds the optimum without an exact quotient;
-    `factored_polca.control.certify.certify` bounds what the polled policy earns too.
+    `factored_polca.control.certify.certify_plan` bounds what the polled policy earns too.
     """
 
     symbolic: SymbolicModel
