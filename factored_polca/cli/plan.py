@@ -198,7 +198,8 @@ def plan_partial(
         found = replace(
             found, certified=certify_plan(found, policy, deadline=deadline, seed=arguments.seed)
         )
-    data = pomdp_plan_report(found, polca) | tried | measured_figures(found, measured)
+    in_time = deadline is None or time.monotonic() < deadline
+    data = pomdp_plan_report(found, polca, list_states=in_time) | tried | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:
         output.warn(warning)

@@ -12,13 +12,16 @@ from factored_polca.hierarchy.pomdp_solved import SolvedPomdpTask
 from factored_polca.hierarchy.solved import StructuredTask
 
 
-def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) -> dict[str, Any]:
+def pomdp_plan_report(
+    plan: PomdpPlan, polca: HierarchicalPlan | None = None, *, list_states: bool = True
+) -> dict[str, Any]:
     """Figures of a plan: the tasks children first, and what no policy can exceed.
 
-    `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.
+    `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.  The
+    number without abstraction takes listing all states, which `list_states` may forbid.
     """
     processes = [solved.reduction.process for solved in plan.solved]
-    none = unreduced_parameters(plan.symbolic, processes)
+    none = unreduced_parameters(plan.symbolic, processes) if list_states else None
     tasks = [
         task_report(solved)
         | {
