@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         independent_belief,
     )
     from factored_polca.control.belief_controller import BeliefController, BeliefDecision, plan_tracker
+    from factored_polca.control.certify import certify_plan
     from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit
     from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
     from factored_polca.formats import Document, read, write
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     )
     from factored_polca.hierarchy.executable import ExecutablePlan, executable
     from factored_polca.hierarchy.irrelevance import ValueClasses, executable_by_classes, value_classes
+    from factored_polca.hierarchy.merging import CertifiedBounds
     from factored_polca.hierarchy.plan_file import load_plan, save_plan
     from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
     from factored_polca.hierarchy.pomdp_plan_file import load_pomdp_plan, save_pomdp_plan
@@ -96,6 +98,7 @@ __version__ = "0.1.0"
 _HOME: Final = {
     "control": ("Belief", "Controller", "Decision", "Poll", "choose_tracker", "independent_belief"),
     "control.belief_controller": ("BeliefController", "BeliefDecision", "plan_tracker"),
+    "control.certify": ("certify_plan",),
     "diagrams": ("Aborted", "Diagram", "Manager", "MemoryLimit"),
     "explicit.pomdp_arrays": ("ArrayPOMDP", "array_pomdp"),
     "formats": ("Document", "read", "write"),
@@ -105,6 +108,7 @@ _HOME: Final = {
     ),
     "hierarchy.executable": ("ExecutablePlan", "executable"),
     "hierarchy.irrelevance": ("ValueClasses", "executable_by_classes", "value_classes"),
+    "hierarchy.merging": ("CertifiedBounds",),
     "hierarchy.plan_file": ("load_plan", "save_plan"),
     "hierarchy.pomdp_executable": ("ExecutablePomdpPlan", "executable_pomdp"),
     "hierarchy.pomdp_plan_file": ("load_pomdp_plan", "save_pomdp_plan"),
@@ -144,21 +148,21 @@ _MODULE: Final = {name: module for module, names in _HOME.items() for name in na
 
 __all__ = [
     "Aborted", "Action", "ArrayPOMDP", "Belief", "BeliefController", "BeliefDecision", "BeliefRuns",
-    "Certificate", "Comparison", "Controller", "Decision", "Demand", "Diagram", "Document",
-    "ExecutablePlan", "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan", "InitialBelief",
-    "LimitReached", "MDPSolution", "Manager", "MdpSolver", "Measurement", "MemoryLimit", "Minimisation",
-    "Model", "ModelError", "Observation", "Options", "POMDPSolution", "ParametricProcess",
-    "ParametricQuotient", "Partition", "Poll", "PomdpPlan", "PomdpSolver", "Reduction", "Sensitivity",
-    "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task", "TaskHierarchy", "Trace",
-    "ValueClasses", "__version__", "alpha_vectors", "array_pomdp", "boolean", "certify", "check",
-    "check_tasks", "choose_tracker", "compare", "compile_model", "compile_parametric", "conditional",
-    "domains", "executable", "executable_by_classes", "executable_pomdp", "flat_process",
-    "independent_belief", "load_domain", "load_plan", "load_pomdp_plan", "lottery", "measure",
-    "minimise", "parametric_flat_process", "parametric_process", "plan", "plan_mdp", "plan_pomdp",
-    "plan_report", "plan_tracker", "reachable_states", "read", "reduce", "reduce_parametric",
-    "save_plan", "save_pomdp_plan", "sensitivity", "simulate", "solution_of_actions",
-    "solution_of_policy", "solve_mdp", "solve_pomdp", "trace", "uniform", "unreduced_pomdp",
-    "value_classes", "write",
+    "Certificate", "CertifiedBounds", "Comparison", "Controller", "Decision", "Demand", "Diagram",
+    "Document", "ExecutablePlan", "ExecutablePomdpPlan", "Fault", "Feature", "HierarchicalPlan",
+    "InitialBelief", "LimitReached", "MDPSolution", "Manager", "MdpSolver", "Measurement",
+    "MemoryLimit", "Minimisation", "Model", "ModelError", "Observation", "Options", "POMDPSolution",
+    "ParametricProcess", "ParametricQuotient", "Partition", "Poll", "PomdpPlan", "PomdpSolver",
+    "Reduction", "Sensitivity", "Simulation", "SolvedPomdpTask", "SolvedTask", "SymbolicModel", "Task",
+    "TaskHierarchy", "Trace", "ValueClasses", "__version__", "alpha_vectors", "array_pomdp", "boolean",
+    "certify", "certify_plan", "check", "check_tasks", "choose_tracker", "compare", "compile_model",
+    "compile_parametric", "conditional", "domains", "executable", "executable_by_classes",
+    "executable_pomdp", "flat_process", "independent_belief", "load_domain", "load_plan",
+    "load_pomdp_plan", "lottery", "measure", "minimise", "parametric_flat_process",
+    "parametric_process", "plan", "plan_mdp", "plan_pomdp", "plan_report", "plan_tracker",
+    "reachable_states", "read", "reduce", "reduce_parametric", "save_plan", "save_pomdp_plan",
+    "sensitivity", "simulate", "solution_of_actions", "solution_of_policy", "solve_mdp", "solve_pomdp",
+    "trace", "uniform", "unreduced_pomdp", "value_classes", "write",
 ]  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from factored_polca.approximation.approximate import (
     certify_mdp,
     certify_pomdp,
 )
+from factored_polca.approximation.bracket import bracketed
 from factored_polca.approximation.certificate import certify_policy
 from factored_polca.approximation.representatives import Representatives, cover, distance
 from factored_polca.approximation.snap import as_epsilon, drop_parents, snap
@@ -49,7 +50,7 @@ ORACLE = 1e-9
 EPSILONS = ("0.02", "0.1", "0.3")
 SEEDS = range(100)
 
-MOST_BELIEFS = 2_000
+MOST_BELIEFS = 1_000
 
 PURPOSELESS = (36,)
 
@@ -174,6 +175,11 @@ def test_snapped_rows_and_rewards_stay_within_epsilon(seed: int, partial: bool) 
             assert all(abs(old.values[i] - new.values[j]) <= radius for i, j in zip(a, b, strict=True))
 
 
+def nearby(model: Model, seed: int) -> Model:
+    """The model with a discount up to 0.9, but one in ten as it is: iterating far takes the oracle long."""
+    return model if seed % 10 == 0 else replace_fields(model, discount=min(model.discount, Fraction(9, 10)))
+
+
 # -- policies of fully observed models against all states ------------------------------------------
 
 
@@ -192,7 +198,7 @@ def worth(initial: np.ndarray, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
-    model = random_model(seed, max_states=96)
+    model = nearby(random_model(seed, max_states=40), seed)
     epsilon = EPSILONS[seed % 3]
     symbolic = compile_model(model)
     process = flat_process(symbolic)
@@ -207,7 +213,7 @@ def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
     earned = worth(initial, dynamic_programming.evaluate_policy(arrays, taken.tolist()))
     slack = ORACLE * max(1.0, abs(best))
     one_step = certify_mdp(found, solution.policy, steps=1, seed=seed)
-    further = certify_mdp(found, solution.policy, seed=seed)
+    further = certify_mdp(found, solution.policy, steps=10, seed=seed)
     by_errors = certify_mdp(found, solution.policy, class_limit=0, seed=seed)
     assert by_errors.classes is None
     assert further.classes is not None
@@ -216,7 +222,7 @@ def test_the_bounds_of_random_mdps_hold(seed: int) -> None:
         assert best <= certain.optimum + slack
         assert best - earned <= certain.loss + slack
     assert abs(best - earned) <= 2 * one_step.model_error + (slack if found.stable else np.inf)
-    assert bounded_optimum(found, seed=seed) >= best - slack
+    assert bounded_optimum(found, steps=10, seed=seed) >= best - slack
     assert found.partition.blocks <= reduce(process).partition.blocks
 
 
@@ -225,7 +231,7 @@ def test_bounds_of_a_coarse_partition_and_a_bad_policy_hold(seed: int) -> None:
     """Any partition that respects the masks, any policy on it: here the masks alone, choices at random."""
     from factored_polca.approximation.aggregate import masks
 
-    model = random_model(seed, max_states=96)
+    model = random_model(seed, max_states=48)
     symbolic = compile_model(model)
     process, exact = flat_process(symbolic), enumerate_model(model)
     arrays, states = exact.to_arrays(), state_numbers(model, exact)
@@ -307,9 +313,9 @@ def test_nothing_is_lost_where_there_is_nothing_to_choose() -> None:
 # -- hierarchies -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(0, 60, 2))
+@pytest.mark.parametrize("seed", range(0, 60, 4))
 def test_the_bounds_of_random_hierarchies_hold(seed: int) -> None:
-    model = random_model(seed, max_states=64)
+    model = nearby(random_model(seed, max_states=64), seed)
     tasks = random_tasks(seed, model)
     options = Options(merge_within=EPSILONS[seed // 2 % 3], flat_block_limit=1000, seed=seed)
     if seed in PURPOSELESS:  # with other policies of its children the root earns one constant
@@ -411,9 +417,13 @@ def test_the_bounds_of_random_pomdps_hold(seed: int) -> None:
     low, high = followed(pomdp, block, found.partition.blocks, solution.policy, 12)
     optimum_low, optimum_high = bracket(pomdp, pomdp.initial[None, :], most=MOST_BELIEFS)
     slack = 1e-8 * max(1.0, float(np.abs(pomdp.rewards).max()))
-    assert certain.lower <= high + slack
-    assert float(optimum_low[0]) <= certain.optimum + slack
-    assert float(optimum_low[0]) - high <= certain.loss + slack
+    tighter = bracketed(found, solution, certain, block_limit=100, beliefs=20, trials=5)
+    assert tighter.loss <= certain.loss
+    for bounds in (certain, tighter):
+        assert bounds.lower <= high + slack
+        assert low <= bounds.upper + slack
+        assert float(optimum_low[0]) <= bounds.optimum + slack
+        assert float(optimum_low[0]) - high <= bounds.loss + slack
     assert low <= float(optimum_high[0]) + slack  # the oracle agrees with itself
 
 

@@ -22,7 +22,7 @@ from factored_polca.control.likeliest import LikeliestController, likeliest_trac
 from factored_polca.hierarchy import Options, plan_mdp, plan_pomdp
 from factored_polca.hierarchy.executable import executable
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan, executable_pomdp
-from factored_polca.models import ModelError, flat_task
+from factored_polca.models import ModelError, Task, TaskHierarchy, flat_task
 from factored_polca.simulation import belief_episodes
 from factored_polca.simulation.belief_episodes import run_one_by_one
 from factored_polca.simulation.belief_runs import BeliefRuns, run_on_blocks
@@ -178,3 +178,19 @@ def test_too_much_is_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     for tracker in (plan_tracker(plan).tracker, DiagramTracker(plan.symbolic)):
         assert answers(tracker.start({}), 0) is None  # four words
         assert answers(tracker.start({}), 1) is not None  # nothing is sensed
+
+
+def test_a_task_is_measured_also_where_its_child_does_what_it_never_does_when_certain() -> None:
+    """At corners `Open` opens a door at once, and so `Wait` knows of no listening; polled it listens."""
+    tiger = library.load("tiger").model
+    names = [action.name for action in tiger.actions]
+    listen = names.index("listen")
+    above = [Task("Root", ["Wait", "open_left"]), Task("Wait", ["Open", "open_left"])]
+    tasks = TaskHierarchy([*above, Task("Open", names)])
+    plan = executable_pomdp(plan_pomdp(tiger, tasks, Options(flat_block_limit=None)))
+    assert listen not in plan.process("Wait").rewards
+    assert sorted(plan.rewards("Wait")) == [0, 1, 2]
+    runs = measure(plan, episodes=4000, child_episodes=4000).runs
+    # Polling leads to Open's own policy in both, which is the optimum of tiger.
+    assert_near(runs["Root"], 19.3714)
+    assert_near(runs["Wait"], 19.3714)

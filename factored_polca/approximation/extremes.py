@@ -33,6 +33,10 @@ from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 UNIT: Final = 2.0**-53
 SWEEPS: Final = 40
 """Sweeps with classes and choices held between two choices of them."""
+DENSE: Final = 300
+"""Blocks up to which a linear system takes the place of these sweeps."""
+SOLVED: Final = 30
+"""Rounds in which it does: where choices and classes change in turn, they may go round in a circle."""
 MAXIMUM_ROUNDS: Final = 10_000
 CLOSE: Final = 1e-10
 """Relative change at which iteration ends; what is missing is added to the bound."""
@@ -118,14 +122,14 @@ def extreme_values(
         return np.where(live, outer.reduceat(best, game.starts), 0.0), q
 
     kept = live & ~lost
-    for _ in range(MAXIMUM_ROUNDS):
+    for number in range(MAXIMUM_ROUNDS):
         game.pause()
         new, q = backed(values)
         change = float(np.abs(new[kept] - values[kept]).max(initial=0.0))
         values = new
         if change <= CLOSE * max(1.0, float(np.abs(values[kept]).max(initial=0.0))):
             break
-        values = _swept(game, rewards, q, values, kept)
+        values = _swept(game, rewards, q, values, kept, solve=number < SOLVED)
     new, _ = backed(values)
     error = game.rounding(np.where(allowed, rewards, 0.0), np.where(kept, values, 0.0))
     wrong = new[kept] - values[kept] if side == "upper" else values[kept] - new[kept]
@@ -136,9 +140,9 @@ def extreme_values(
 
 
 def _swept(
-    game: Game, rewards: FloatArray, q: FloatArray, values: FloatArray, kept: BoolArray
+    game: Game, rewards: FloatArray, q: FloatArray, values: FloatArray, kept: BoolArray, *, solve: bool
 ) -> FloatArray:
-    """Sweeps over the class and choice that attain the extreme in each block."""
+    """Sweeps over the class and choice that attain the extreme in each block, or what they lead to."""
     best, choice = q.max(axis=0), q.argmax(axis=0)
     attained = np.flatnonzero(best == values[game.block])
     chosen = np.full(len(values), -1, dtype=np.int64)
@@ -148,8 +152,13 @@ def _swept(
     rows, gains = game.rows[picked], rewards.reshape(-1)[picked]
     values = np.where(np.isneginf(values), 0.0, values)
     lost = ~kept & ~game.terminal
-    for _ in range(SWEEPS):
-        values[here] = gains + game.discount * (rows @ values)
+    if solve and 0 < len(here) <= DENSE and game.discount < 1:
+        values[here] = 0.0
+        system = np.eye(len(here)) - game.discount * rows[:, here].toarray()
+        values[here] = np.linalg.solve(system, gains + game.discount * (rows @ values))
+    else:
+        for _ in range(SWEEPS):
+            values[here] = gains + game.discount * (rows @ values)
     values[lost] = -np.inf
     return values
 

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from factored_polca.cli.approximation_arguments import print_merging, tried_report
 from factored_polca.cli.commands import (
@@ -162,6 +162,7 @@ def plan_partial(
     compile_seconds: float,
 ) -> dict[str, Any]:
     """PolCA+: the figures of the plan, measured, which is written where that is asked for."""
+    from factored_polca.control.certify import certify_plan
     from factored_polca.hierarchy import plan_pomdp
     from factored_polca.hierarchy.merging import merging_report
     from factored_polca.hierarchy.pomdp_executable import executable_pomdp
@@ -181,6 +182,7 @@ def plan_partial(
             found, tried = within_loss(source, options, arguments.loss, progress)
         polca = planned_as_seen(source, options, output)
         policy = executable_pomdp(found, merging_report(found.root.approximation, found.certified))
+        deadline = extended(options.deadline, arguments)
         output.update(f"measuring {source.name}")
         measured = measure(
             policy,
@@ -190,14 +192,25 @@ def plan_partial(
             progress=lambda task, first, step: output.update(
                 f"measuring {task}: episodes from {first + 1:,} on, step {step:,}"
             ),
+            deadline=deadline,
         )
-    data = pomdp_plan_report(found, polca) | tried | measured_figures(found, measured)
+        output.update(f"certifying {source.name}")
+        found = replace(
+            found, certified=certify_plan(found, policy, deadline=deadline, seed=arguments.seed)
+        )
+    in_time = deadline is None or time.monotonic() < deadline
+    data = pomdp_plan_report(found, polca, list_states=in_time) | tried | measured_figures(found, measured)
     data |= figures(arguments, source, compile_seconds)
     for warning in found.warnings:
         output.warn(warning)
     if arguments.output is not None:
         save_pomdp_plan(executable_pomdp(found, finite(data)), arguments.output)
     return data
+
+
+def extended(deadline: float | None, arguments: argparse.Namespace) -> float | None:
+    """When measuring is to stop: a quarter of `--time` is left for it in any case."""
+    return None if deadline is None else max(deadline, time.monotonic() + arguments.time / 4)
 
 
 def within_loss(
@@ -212,6 +225,7 @@ def within_loss(
 
 def planned_as_seen(source: Source, options: Options, output: Output) -> HierarchicalPlan | None:
     """The same hierarchy planned as if the state were seen, for comparison; None where PolCA can't."""
+    from factored_polca.diagrams import Aborted, MemoryLimit
     from factored_polca.hierarchy import plan_mdp
 
     try:
@@ -219,29 +233,29 @@ def planned_as_seen(source: Source, options: Options, output: Output) -> Hierarc
             options, assume_observed=True, flat_block_limit=None, solver="auto", merge_within=None
         )
         return plan_mdp(source.model, source.tasks, seen)
-    except (ModelError, LimitReached) as error:
+    except (ModelError, LimitReached, MemoryLimit, Aborted) as error:
         output.note(f"PolCA, for comparison, is left out: {error}")
         return None
 
 
 def measured_figures(found: PomdpPlan, measured: Measurement) -> dict[str, Any]:
-    """What polling earned, and how beliefs were tracked."""
-    runs = measured.runs[found.root.task.name]
+    """What polling earned, and how beliefs were tracked; no value where time was up before."""
+    runs = measured.runs.get(found.root.task.name)
+    counts = [0] * len(found.model.actions) if runs is None else runs.counts.tolist()
     return {
-        "value": runs.mean,
-        "standard_error": runs.standard_error,
+        "value": None if runs is None else runs.mean,
+        "standard_error": None if runs is None else runs.standard_error,
         "lower": found.root.lower,
         "upper": found.root.upper,
-        "episodes": runs.episodes,
-        "steps": runs.steps,
-        "truncation": runs.truncation,
+        "episodes": 0 if runs is None else runs.episodes,
+        "steps": 0 if runs is None else runs.steps,
+        "truncation": None if runs is None else runs.truncation,
         "measured": {
             name: {"value": run.mean, "standard_error": run.standard_error, "episodes": run.episodes}
             for name, run in measured.runs.items()
         },
         "action_counts": {
-            action.name: int(count)
-            for action, count in zip(found.model.actions, runs.counts.tolist(), strict=True)
+            action.name: int(count) for action, count in zip(found.model.actions, counts, strict=True)
         },
         "tracker": measured.tracker.kind,
         "tracker_reason": measured.tracker.reason,
@@ -252,7 +266,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     """The figures of a plan by PolCA for people."""
     columns = {
         "task": "left", "actions": "right", "blocks": "right", "Q-values": "right", "classes": "right",
-        "shared": "right", "value": "right", "time": "right",
+        "shared": "right", "value": "right", "time": "right", **cut_column(data),
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
@@ -260,7 +274,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         table.add_row(
             escape(row["name"]), f"{len(row['actions'])}",
             *(counted(row[key]) for key in ("blocks", "q_values", "q_classes", "q_classes_shared")),
-            value, seconds(row["seconds"]),
+            value, seconds(row["seconds"]), *([row["status"]] if cut_column(data) else []),
         )  # fmt: skip
     table.add_section()
     total = data["totals"]
@@ -269,6 +283,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         f"{total['q_classes']:,}", f"{total['q_classes_shared']:,}", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
+    print_status(data, output)
     output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
     for row in data["tasks"]:
         if row["blocks"] is None:
@@ -292,6 +307,24 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     output.line(f"guarantee: {escape(data['guarantee'])}")
 
 
+def longer(data: dict[str, Any]) -> str:
+    """What longer episodes could change, where time has made them shorter than they would have been."""
+    if data["truncation"] <= max(data["standard_error"], 1e-6 * abs(data["value"])):
+        return ""
+    return f"; longer ones may change it by {data['truncation']:.2g}"
+
+
+def cut_column(data: dict[str, Any]) -> dict[str, Literal["left"]]:
+    """The column that tells how searches ended, where a limit cut one short."""
+    return {} if data["status"] == "complete" else {"status": "left"}
+
+
+def print_status(data: dict[str, Any], output: Output) -> None:
+    """Say that a limit was reached, where it was."""
+    if data["status"] != "complete":
+        output.line(f"[bold]{data['status']}[/]: the best plan so far; bounds hold, and may be wide")
+
+
 def within(value: float, bounds: Sequence[float]) -> str:
     """A value, or its bounds where they are wide."""
     low, high = bounds
@@ -310,7 +343,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
     columns = {
         "task": "left", "actions": "right", "blocks": "right", "observations": "right",
         "unabstracted": "right", "PolCA": "right", "PolCA+": "right", "as planned": "right",
-        "corner gap": "right", "measured": "right", "time": "right",
+        "corner gap": "right", "measured": "right", "time": "right", **cut_column(data),
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
@@ -320,7 +353,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
             f"{sum(c['before'] for c in counts):,} -> {sum(c['after'] for c in counts):,}",
             *parameters_text(row["parameters"]), f"{brief(row['lower'])} .. {brief(row['upper'])}",
             f"{row['corner_gap']:.2g}", "" if measured is None else measured_text(measured),
-            seconds(row["seconds"]),
+            seconds(row["seconds"]), *([row["status"]] if cut_column(data) else []),
         )  # fmt: skip
     table.add_section()
     table.add_row(
@@ -328,22 +361,37 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         *parameters_text(data["totals"]["parameters"]), "", "", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
+    print_status(data, output)
     output.line(
         "observations: joint ones of all actions, before and after merging; unabstracted, PolCA, PolCA+: "
         "parameters of the task's model (Figure 4a); as planned: bounds in the task's own model, where a "
         "child does what it does when certain of the state"
     )
-    output.line(
-        f"the hierarchical policy earns [bold]{data['value']:.6g}[/] ± {data['standard_error']:.2g} from "
-        f"the start (mean and standard error, {data['episodes']:,} episodes of {data['steps']:,} steps)"
-    )
+    if data["value"] is None:
+        output.line("what the hierarchical policy earns was not measured: time was up")
+    else:
+        output.line(
+            f"the hierarchical policy earns [bold]{data['value']:.6g}[/] ± {data['standard_error']:.2g} "
+            f"from the start (mean and standard error, {data['episodes']:,} episodes of {data['steps']:,} "
+            f"steps{longer(data)})"
+        )
     if data["flat_upper"] is None:
         output.line(f"bound on all policies: {escape(data['flat_note'])}")
     else:
         output.line(f"no policy earns more than {data['flat_upper']:.6g} ({escape(data['flat_note'])})")
+    print_certified(data["certified"], output)
     output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
     print_merging(data, output)
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def print_certified(certified: dict[str, Any], output: Output) -> None:
+    """What the hierarchical policy surely earns."""
+    low, high, note = certified["polled_lower"], certified["polled_upper"], escape(certified["note"])
+    if low is None:
+        output.line(f"certified: {note}")
+    else:
+        output.line(f"certified: the hierarchical policy earns {brief(low)} .. {brief(high)} ({note})")
 
 
 def brief(value: float) -> str:

@@ -69,9 +69,16 @@ def block_state(partition: Partition, block: int) -> dict[str, Value]:
 
 
 def plan_tracker(
-    plan: ExecutablePomdpPlan, *, on_impossible: OnImpossible = "error", seed: int = 0
+    plan: ExecutablePomdpPlan,
+    *,
+    on_impossible: OnImpossible = "error",
+    seed: int = 0,
+    deadline: float | None = None,
 ) -> ChosenTracker:
-    """The tracker that fits a plan: on the common refinement of its tasks, else others."""
+    """The tracker that fits a plan: on the common refinement of its tasks, else others.
+
+    Blocks and diagrams are given up at `deadline`, a reading of `time.monotonic()`.
+    """
     return choose_tracker(
         plan.symbolic,
         plan.partitions,
@@ -79,6 +86,7 @@ def plan_tracker(
         features=tracked_features(plan),
         on_impossible=on_impossible,
         seed=seed,
+        deadline=deadline,
     )
 
 

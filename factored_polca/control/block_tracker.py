@@ -70,6 +70,18 @@ def feature_diagram(symbolic: SymbolicModel, feature: int) -> Diagram:
     return manager.variable(symbolic.now(feature), [manager.constant(v) for v in values])
 
 
+def kept_apart(
+    symbolic: SymbolicModel,
+    partitions: Sequence[Partition],
+    conditions: Sequence[Diagram],
+    features: Sequence[str] = (),
+) -> list[Diagram]:
+    """What a partition to track with must tell apart: these things, and what is seen of the state."""
+    shown = [i for i, f in enumerate(symbolic.model.features) if f.observed or f.name in features]
+    separate = [partition.diagram for partition in partitions] + list(conditions)
+    return separate + [feature_diagram(symbolic, i) for i in shown]
+
+
 def make_block_tracker(
     symbolic: SymbolicModel,
     partitions: Sequence[Partition] = (),
@@ -97,9 +109,7 @@ def make_block_tracker(
     for name in features:
         if name not in names:
             raise ModelError(f"no feature {name!r}; there are {', '.join(names)}")
-    shown = {i for i, f in enumerate(symbolic.model.features) if f.observed or f.name in features}
-    separate = [partition.diagram for partition in partitions] + list(conditions)
-    separate += [feature_diagram(symbolic, i) for i in sorted(shown)]
+    separate = kept_apart(symbolic, partitions, conditions, features)
     process = tracking_process(symbolic, reachable)
     found = minimise(process, seed=seed, block_limit=block_limit, separate=separate)
     tracker = BlockTracker(found.partition, on_impossible)

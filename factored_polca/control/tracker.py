@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.control.received import ObservationReader, Received, shown, value_number
-from factored_polca.diagrams import Diagram, Manager, MemoryLimit, support
+from factored_polca.diagrams import Aborted, Diagram, Manager, MemoryLimit, support
 from factored_polca.explicit.belief import ImpossibleObservation
 from factored_polca.explicit.exact_pomdp import observation_label
 from factored_polca.minimisation import Partition
@@ -252,14 +252,18 @@ def summed(labels: IntArray, weights: FloatArray, count: int) -> FloatArray:
 
 
 @contextmanager
-def limited_memory(manager: Manager, room: int) -> Iterator[None]:
-    """Inside, diagrams take at most `room` bytes more, and `SPARE` of them in any case."""
-    before = manager.memory_limit
-    manager.memory_limit = min(before, manager.bytes + SPARE + room)
+def limited_memory(manager: Manager, room: int, deadline: float | None = None) -> Iterator[None]:
+    """Inside, diagrams take at most `room` bytes more, and `SPARE` of them in any case.
+
+    `deadline` (a reading of `time.monotonic()`) takes the place of the manager's own.
+    """
+    before = manager.memory_limit, manager.deadline
+    manager.memory_limit = min(before[0], manager.bytes + SPARE + room)
+    manager.deadline = before[1] if deadline is None else deadline
     try:
         yield
     finally:
-        manager.memory_limit = before
+        manager.memory_limit, manager.deadline = before
 
 
 # -- beliefs to start from -------------------------------------------------------------------------
@@ -327,6 +331,7 @@ def choose_tracker(
     node_limit: int = NODE_LIMIT,
     particles: int = PARTICLES,
     seed: int = 0,
+    deadline: float | None = None,
 ) -> ChosenTracker:
     """The tracker that fits the model: over blocks, else as a diagram, else particles.
 
@@ -340,6 +345,7 @@ def choose_tracker(
             `TRIED_STEPS` steps; 0 leaves diagrams out.
         particles: how many there are if it comes to them.
         seed: of random elements, of the history that is tried and of particles.
+        deadline: a reading of `time.monotonic()` at which blocks, and then diagrams, are given up.
 
     Raises:
         ModelError: a fully observed model, or no such feature.
@@ -352,21 +358,22 @@ def choose_tracker(
     reasons = []
     if block_limit > 0:
         try:
-            with limited_memory(symbolic.manager, BYTES_PER_BLOCK * block_limit):
+            with limited_memory(symbolic.manager, BYTES_PER_BLOCK * block_limit, deadline):
                 blocks = make_block_tracker(
                     symbolic, partitions, conditions=conditions, features=features, reachable=reachable,
                     block_limit=block_limit, seed=seed, on_impossible=on_impossible,
                 )  # fmt: skip
             return ChosenTracker(blocks, f"the common refinement has {blocks.partition.blocks:,} blocks")
-        except (LimitReached, MemoryLimit) as error:
+        except (LimitReached, MemoryLimit, Aborted) as error:
             reasons.append(f"no tracker over blocks: {error}")
     if node_limit > 0:
         try:
-            diagram = DiagramTracker(symbolic, node_limit=node_limit, on_impossible=on_impossible)
-            largest = try_history(diagram, random_history(symbolic, TRIED_STEPS, seed))
+            with limited_memory(symbolic.manager, symbolic.manager.memory_limit, deadline):
+                diagram = DiagramTracker(symbolic, node_limit=node_limit, on_impossible=on_impossible)
+                largest = try_history(diagram, random_history(symbolic, TRIED_STEPS, seed))
             reasons.append(f"beliefs that were tried have up to {largest:,} nodes")
             return ChosenTracker(diagram, "; ".join(reasons))
-        except LimitReached as error:
+        except (LimitReached, Aborted) as error:
             reasons.append(f"no belief as a diagram: {error}")
     tracker = ParticleTracker(symbolic, particles, seed=seed, on_impossible=on_impossible)
     reasons.append(f"{particles:,} particles")

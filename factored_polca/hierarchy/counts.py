@@ -13,7 +13,9 @@ by the fingerprint sum_k r_k T(x, k) in GF(p) with p and r drawn at random, neve
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +35,26 @@ class QValueCounts:
     q_applicable: int
     q_classes: int
     q_classes_shared: int
+
+
+class Counted(Protocol):
+    """A solved task; None where it was solved without blocks."""
+
+    @property
+    def counts(self) -> QValueCounts | None:
+        """The counts of the task."""
+
+
+def total_counts(solved: Mapping[str, Counted] | Sequence[Counted]) -> QValueCounts:
+    """The counts of all subtasks together that were solved over blocks."""
+    tasks = list(solved.values()) if isinstance(solved, Mapping) else list(solved)
+    counts = [task.counts for task in tasks if task.counts is not None]
+    return QValueCounts(
+        sum(count.q_values for count in counts),
+        sum(count.q_applicable for count in counts),
+        sum(count.q_classes for count in counts),
+        sum(count.q_classes_shared for count in counts),
+    )
 
 
 def count_q_values(process: DecisionProcess, partition: Partition, seed: int = 0) -> QValueCounts:

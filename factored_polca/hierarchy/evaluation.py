@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factored_polca.hierarchy.solved import AnySolvedTask, StructuredTask
 from factored_polca.minimisation import Reduction
 from factored_polca.solvers import Guarantee, MDPSolution
 from factored_polca.structured.solution import StructuredSolution
@@ -43,6 +44,23 @@ def evaluate(reduction: Reduction, solution: MDPSolution) -> Evaluation:
 def evaluate_structured(solution: StructuredSolution) -> Evaluation:
     """The value at the initial belief of what was solved on diagrams."""
     return Evaluation(solution.value, solution.lower, solution.upper, None, solution.guarantee)
+
+
+def root_bounds(root: AnySolvedTask, reason: str) -> Evaluation:
+    """Bounds on the value of the polled policy from those of the root, whose reward is the model's.
+
+    The root's model is that of its children's policies, so its policy's value is the polled one's.
+    `reason` says why the policy's own chain was not solved.
+    """
+    if isinstance(root, StructuredTask):
+        low, high = root.solution.policy_lower, root.solution.upper
+    else:
+        with root.process.symbolic.manager.undisturbed():
+            belief, solution = root.reduction.project_initial(), root.solution
+        low = expectation(belief, solution.lower) - solution.policy_loss_bound
+        high = expectation(belief, solution.upper)
+    text = f"the root's bounds, as the chain of the polled policy was not solved: {reason}"
+    return Evaluation(0.5 * (low + high), low, high, root.blocks, Guarantee("bounds", text))
 
 
 def describe_block(reduction: Reduction, block: int) -> str:

@@ -71,4 +71,6 @@ def plan_within_loss(
         raise ModelError([Fault(message, (), "give a larger --loss, or solve to a smaller --gap")])
     final = replace(options, merge_within=found.epsilon)
     work = plan_mdp if seen else plan_pomdp
-    return work(model, hierarchy, final, progress=progress, symbolic=symbolic), tried
+    best = work(model, hierarchy, final, progress=progress, symbolic=symbolic)
+    symbolic.manager.deadline = None  # of planning; the plan may be used for longer
+    return best, tried

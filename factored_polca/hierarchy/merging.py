@@ -26,6 +26,7 @@ from factored_polca.approximation.approximate import (
     certify_mdp,
     certify_pomdp,
 )
+from factored_polca.approximation.bracket import bracketed
 from factored_polca.approximation.snap import Snapped, as_epsilon, snap
 from factored_polca.diagrams import FLOAT, Aborted, Diagram, MemoryLimit, choose, leaves
 from factored_polca.hierarchy.evaluation import Evaluation
@@ -40,7 +41,8 @@ from factored_polca.symbolic import NumericView, SymbolicModel
 
 @dataclass(frozen=True)
 class CertifiedBounds:
-    """What is certain of a plan whose tasks were merged approximately, under the model's reward.
+    """What is certain of a plan under the model's reward: of one whose tasks were merged approximately, or
+    whose state is not seen.
 
     `polled_lower` <= what the polled policy earns <= `polled_upper`, what any policy earns <=
     `optimum_upper`; None where a bound was left out, and `note` says why.
@@ -125,15 +127,26 @@ class Merging:
         return replace(found, measured_loss=loss, measured_note="the exact quotients, solved")
 
     def certify_pomdp(self, reduction: Reduction, solution: POMDPSolution) -> Approximation:
-        """What is certain of a task's policy where the state is not seen.
+        """What is certain of a task's policy where the state is not seen: by the simulation lemma, and by
+        solving and following the task itself where it has few enough blocks.
 
         Raises:
             LimitReached: memory or time.
         """
         assert isinstance(reduction, ApproximateReduction)
+        options = self.options
         with limits_named():
             found = certify_pomdp(reduction, solution)
-        return replace(found, measured_note="the plan's episodes tell")
+        found = replace(found, measured_note="the plan's episodes tell")
+        if options.flat_block_limit is None:
+            return found
+        try:
+            return bracketed(
+                reduction, solution, found, block_limit=options.flat_block_limit,
+                deadline=options.deadline, seed=options.seed,
+            )  # fmt: skip
+        except (LimitReached, MemoryLimit, Aborted) as error:
+            return replace(found, note=f"{found.note}; no bracket: {error}")
 
     def bounds(self, chain: DecisionProcess, flat: DecisionProcess) -> CertifiedBounds:
         """Certified bounds on the value of `chain`, which has one choice, and on the optimum of `flat`."""
@@ -261,11 +274,12 @@ def approximation_report(found: Approximation | None) -> dict[str, Any]:
 
 
 def merging_report(root: Approximation | None, certified: CertifiedBounds | None) -> dict[str, Any]:
-    """What is certain of a whole plan, as plain data; nothing for an exact abstraction."""
-    if root is None or certified is None:
+    """What is certain of a whole plan, as plain data, and how near its merged states are."""
+    if certified is None:
         return {}
+    merged = {} if root is None else {"merge_within": root.epsilon_text}
     return {
-        "merge_within": root.epsilon_text,
+        **merged,
         "certified": {
             "polled_lower": certified.polled_lower,
             "polled_upper": certified.polled_upper,

@@ -15,21 +15,23 @@ a limit: the difference is what the hierarchy costs.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from factored_polca.diagrams import INDEX, Diagram, MemoryLimit, relabel
+from factored_polca.diagrams import INDEX, Aborted, Diagram, MemoryLimit, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import checked, custom_solver, named_solver, planning_order, solver_of
-from factored_polca.hierarchy.counts import QValueCounts, count_exchanged, count_q_values
+from factored_polca.hierarchy.counts import count_exchanged, count_q_values
+from factored_polca.hierarchy.dead_ends import refuse_unavoidable_dead_ends
 from factored_polca.hierarchy.evaluation import (
     Evaluation,
     describe_block,
     evaluate,
     evaluate_structured,
     expectation,
+    root_bounds,
 )
 from factored_polca.hierarchy.merging import (
     CertifiedBounds,
@@ -44,12 +46,12 @@ from factored_polca.hierarchy.structured_task import (
     ASKED_FOR,
     STRUCTURED,
     can_fall_back,
-    lost_start,
     on_diagrams,
     solve_on_diagrams,
 )
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
 from factored_polca.hierarchy.task_warnings import task_warnings
+from factored_polca.hierarchy.time_limit import PlanStatus, plan_status, search_deadline
 from factored_polca.minimisation import DecisionProcess, Reduction, reduce
 from factored_polca.minimisation.polynomial import interchangeable_fault
 from factored_polca.minimisation.reduction import InterchangeableReduction
@@ -104,6 +106,11 @@ class HierarchicalPlan(DrawnGraph, Framed):
     def model(self) -> Model:
         """The model that was planned for."""
         return self.symbolic.model
+
+    @property
+    def status(self) -> PlanStatus:
+        """Whether a limit cut the search of a task short."""
+        return plan_status(solved.status for solved in self.solved)
 
     def task(self, name: str) -> AnySolvedTask:
         """The solved task called `name`.
@@ -172,6 +179,7 @@ def plan_mdp(
         hint = "remove it and give a discount (plan --discount D), or use solve"
         raise ModelError([Fault("a finite horizon can't be planned for", ("horizon",), hint)])
     hierarchy = checked(model, tasks or flat_task(model), assume_observed=options.assume_observed)
+    own = symbolic is None
     symbolic = symbolic or compile_model(
         model,
         order=options.order,
@@ -190,6 +198,8 @@ def plan_mdp(
     warnings = tuple(w for solved in planner.solved.values() for w in solved.warnings)
     seconds = time.perf_counter() - began
     solved = tuple(planner.solved.values())
+    if own:
+        symbolic.manager.deadline = None  # of planning; the plan may be used for longer
     return HierarchicalPlan(symbolic, hierarchy, solved, polled, flat, note, seconds, warnings, certified)
 
 
@@ -255,24 +265,32 @@ class _Planner:
         )
 
     def optimise(
-        self, name: str, reduction: Reduction, method: str, custom: MdpSolver | None = None
+        self,
+        name: str,
+        reduction: Reduction,
+        method: str,
+        custom: MdpSolver | None = None,
+        *,
+        search_until: float | None = None,
     ) -> MDPSolution:
+        """A quotient solved; a search that is cut short at `search_until` is good enough."""
         self.tell(name, "solve", 0, reduction.partition.blocks)
+        options = self.options
+        deadline = options.deadline if search_until is None else search_until
         if custom is not None:
-            options = self.options
-            demand = Demand(gap=options.epsilon, deadline=options.deadline, seed=options.seed)
+            demand = Demand(gap=options.epsilon, deadline=deadline, seed=options.seed)
             solution = call_mdp_solver(custom, reduction.mdp, demand)
         else:
             solution = solve_mdp(
                 reduction.mdp,
                 method,
-                self.options.epsilon,
-                deadline=self.options.deadline,
+                options.epsilon,
+                deadline=deadline,
                 describe=lambda block: describe_block(reduction, block),
             )
         if solution.status == "interrupted":
             raise KeyboardInterrupt
-        if solution.status == "time limit":
+        if solution.status == "time limit" and search_until is None:
             raise LimitReached(
                 f"task {name!r}: the time limit was reached while solving "
                 f"{reduction.partition.blocks:,} blocks (gap {solution.gap:.3g})",
@@ -296,16 +314,18 @@ class _Planner:
             return
         if self.merging is None or not self.merging.has_purpose(process):
             refuse_without_purpose(task, reduction.mdp)
-        solution = self.optimise(task.name, reduction, method, custom)
-        if isinstance(reduction, InterchangeableReduction):
-            counts = count_exchanged(reduction.exchanged)
-        else:
-            counts = count_q_values(process, reduction.partition, self.options.seed)
-        policy = reduction.lift_policy(solution.policy)
-        chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
-        defined = relabel(reduction.partition.diagram, chosen, INDEX)
-        dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
-        value = expectation(reduction.project_initial(), solution.values)
+        until = search_deadline(self.options, is_root=task in self.hierarchy.roots())
+        solution = self.optimise(task.name, reduction, method, custom, search_until=until)
+        with self.symbolic.manager.undisturbed():  # a search may have ended late
+            if isinstance(reduction, InterchangeableReduction):
+                counts = count_exchanged(reduction.exchanged)
+            else:
+                counts = count_q_values(process, reduction.partition, self.options.seed)
+            policy = reduction.lift_policy(solution.policy)
+            chosen = np.append(solution.policy >= 0, False).astype(np.uint64)
+            defined = relabel(reduction.partition.diagram, chosen, INDEX)
+            dead = sum(reduction.partition.sizes[b] for b in np.flatnonzero(solution.dead_ends).tolist())
+            value = expectation(reduction.project_initial(), solution.values)
         approximation = None
         if self.merging is not None:
             self.tell(task.name, "certify", 0, reduction.partition.blocks)
@@ -346,12 +366,26 @@ class _Planner:
         def progress(sweeps: int, gap: float, nodes: int) -> None:
             self.tell(task.name, f"sweep {sweeps}, {nodes:,} nodes, gap {gap:.3g}")
 
-        solved = solve_on_diagrams(task, process, self.options, reason, progress)
+        until = search_deadline(self.options, is_root=task in self.hierarchy.roots())
+        solved = solve_on_diagrams(task, process, self.options, reason, progress, search_until=until)
         self.tell(task.name, "done")
         return solved
 
     def polled(self, root: AnySolvedTask, certified: CertifiedBounds | None) -> Evaluation:
-        """The value of the polled policy under the model's reward."""
+        """The value of the polled policy under the model's reward; the root's bounds where a limit is met.
+
+        Raises:
+            LimitReached: and the root has a reward of its own.
+        """
+        try:
+            return self.polled_chain(root, certified)
+        except (LimitReached, MemoryLimit, Aborted) as error:
+            if certified is not None or root.task.has_pseudo_reward:
+                raise
+            return root_bounds(root, str(error))
+
+    def polled_chain(self, root: AnySolvedTask, certified: CertifiedBounds | None) -> Evaluation:
+        """The value of the polled policy's Markov chain."""
         name, chain = "polled policy", self.chain(root)
         if certified is None:
             method = STRUCTURED if isinstance(root, StructuredTask) else "auto"
@@ -411,39 +445,6 @@ class _Planner:
             if named_solver(self.options.solver) != STRUCTURED:
                 reduction = self.reduce("flat optimum", process, limit)
             found = self.evaluated("flat optimum", process, reduction)
-        except LimitReached as error:
+        except (LimitReached, MemoryLimit, Aborted) as error:
             return None, f"left out: {error}"
         return found, "solved over all primitive actions"
-
-
-def refuse_unavoidable_dead_ends(root: AnySolvedTask) -> None:
-    """Raise an error if the polled policy can run into a dead end from a start state.
-
-    Raises:
-        ModelError: naming such a start.
-    """
-    if isinstance(root, StructuredTask):
-        state = lost_start(root.solution)
-    else:
-        belief = root.reduction.project_initial()
-        lost = np.flatnonzero((belief > 0) & root.solution.dead_ends)
-        state = describe_block(root.reduction, int(lost[0])) if len(lost) else None
-    if state is not None:
-        message = (
-            f"from a start state like {state} every policy of task {root.task.name!r} can run into a state "
-            "that is not terminal and has no applicable action"
-        )
-        hint = "make such states terminal, add an action, or start elsewhere"
-        raise ModelError([Fault(message, ("tasks", root.task.name), hint)])
-
-
-def total_counts(solved: Mapping[str, AnySolvedTask] | Sequence[AnySolvedTask]) -> QValueCounts:
-    """The counts of all subtasks together that were solved over blocks."""
-    tasks = list(solved.values()) if isinstance(solved, Mapping) else list(solved)
-    counts = [task.counts for task in tasks if task.counts is not None]
-    return QValueCounts(
-        sum(count.q_values for count in counts),
-        sum(count.q_applicable for count in counts),
-        sum(count.q_classes for count in counts),
-        sum(count.q_classes_shared for count in counts),
-    )

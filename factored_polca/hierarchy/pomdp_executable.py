@@ -17,13 +17,14 @@ from factored_polca.diagrams import INDEX, Diagram, choose, relabel
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import BoolArray, IntArray
+from factored_polca.explicit.subtask import primitives_below
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
 from factored_polca.hierarchy.pomdp_solved import BeliefPolicy
-from factored_polca.hierarchy.subtask import planning_channels, subtask_process
+from factored_polca.hierarchy.subtask import local_reward, planning_channels, subtask_process
 from factored_polca.minimisation import DecisionProcess, Partition, PomdpQuotient, make_pomdp_quotient
 from factored_polca.models import Model, TaskHierarchy
 from factored_polca.solvers.pomdp_choose import solve_pomdp
-from factored_polca.symbolic import SymbolicModel
+from factored_polca.symbolic import SymbolicModel, Term
 
 OBSERVATIONS: Final = 1_000_000
 """Joint observations that a quotient may have when it is made again; planning has capped them."""
@@ -95,6 +96,13 @@ class ExecutablePomdpPlan(DrawnGraph, Framed):
             reachable = ~partition.diagram.equals(self.symbolic.manager.constant(partition.blocks))
         channels = planning_channels(self.model, task)
         return subtask_process(self.symbolic, task, children, reachable, channels)
+
+    def rewards(self, name: str) -> dict[int, tuple[Term, ...]]:
+        """The reward of task `name` by the number of each primitive that polling it may lead to."""
+        task, numbers = self.tasks.task(name), {a.name: i for i, a in enumerate(self.symbolic.actions)}
+        below = sorted(numbers[action] for action in primitives_below(self.model, self.tasks, name))
+        live = ~self.policies[name].ended
+        return {p: local_reward(self.symbolic, task, p, live) for p in below}
 
     @property
     def snapped(self) -> Snapped:

@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 
 from factored_polca.approximation.approximate import certify_pomdp
-from factored_polca.diagrams import Diagram
+from factored_polca.diagrams import Aborted, Diagram, MemoryLimit
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.hierarchy.check import (
     checked,
@@ -47,6 +47,7 @@ from factored_polca.hierarchy.pomdp_solved import (
     root_beliefs,
 )
 from factored_polca.hierarchy.subtask import planning_channels, refuse_without_purpose, subtask_process
+from factored_polca.hierarchy.time_limit import PlanStatus, cut_short_text, plan_status, search_deadline
 from factored_polca.minimisation import DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.models import Fault, LimitReached, Model, ModelError, Task, TaskHierarchy, flat_task
 from factored_polca.solvers.pomdp_choose import solve_pomdp
@@ -77,7 +78,8 @@ class FlatBound:
 class PomdpPlan(DrawnGraph, Framed):
     """A hierarchy solved under partial observability; `solved` lists the tasks children first.
 
-    Where near states were merged, `certified` bounds the optimum without an exact quotient.
+    Where near states were merged, `certified` bounds the optimum without an exact quotient;
+    `factored_polca.control.certify.certify_plan` bounds what the polled policy earns too.
     """
 
     symbolic: SymbolicModel
@@ -100,6 +102,11 @@ class PomdpPlan(DrawnGraph, Framed):
     def model(self) -> Model:
         """The model that was planned for."""
         return self.symbolic.model
+
+    @property
+    def status(self) -> PlanStatus:
+        """Whether a limit cut the search of a task short."""
+        return plan_status(solved.solution.status for solved in self.solved)
 
     def task(self, name: str) -> SolvedPomdpTask:
         """The solved task called `name`.
@@ -133,6 +140,7 @@ def plan_pomdp(
     began = time.perf_counter()
     refuse_unplannable(model)
     hierarchy = checked(model, tasks or flat_task(model))
+    own = symbolic is None
     symbolic = symbolic or compile_model(
         model,
         order=options.order,
@@ -147,6 +155,8 @@ def plan_pomdp(
     solved = tuple(planner.solved.values())
     warnings = tuple(w for one in solved for w in one.warnings)
     seconds = time.perf_counter() - began
+    if own:
+        symbolic.manager.deadline = None  # of planning; the plan may be used for longer
     return PomdpPlan(symbolic, hierarchy, solved, flat, seconds, warnings, certified)
 
 
@@ -249,9 +259,11 @@ class _Planner:
         solution = self.optimise(task, reduction, method, is_root)
         policy = belief_policy(solution)
         corner, ties = corner_choices(policy, reduction.partition.blocks)
+        with self.symbolic.manager.undisturbed():  # a search may have ended late
+            lifted = reduction.lift_policy(corner)
         now = time.perf_counter()
         self.solved[task.name] = SolvedPomdpTask(
-            task, reduction, solution, policy, corner, reduction.lift_policy(corner),
+            task, reduction, solution, policy, corner, lifted,
             self.symbolic.manager.constant(1), ties, now - began, minimised - began,
             task_warnings(task, solution, is_child=not is_root),
             None if self.merging is None else self.merging.certify_pomdp(reduction, solution),
@@ -267,7 +279,7 @@ class _Planner:
         span = float(np.ptp(np.append(pomdp.rewards[:, ~pomdp.terminal], 0.0)))
         demand = Demand(
             gap=options.gap if options.gap is not None else max(RELATIVE_GAP * span, 1e-12),
-            deadline=options.deadline,
+            deadline=search_deadline(options, is_root=is_root),
             iterations=options.trials if method in SEARCHES else None,
             seed=options.seed,
         )
@@ -278,13 +290,6 @@ class _Planner:
             solution = solve_pomdp(pomdp, method, demand=demand, roots=roots)
         if solution.status == "interrupted":
             raise KeyboardInterrupt
-        if solution.status == "time limit":
-            raise LimitReached(
-                f"task {task.name!r}: the time limit was reached while solving {blocks:,} blocks "
-                f"(gap {solution.gap:.3g})",
-                "solve",
-                solution,
-            )
         return solution
 
     def certified(self) -> CertifiedBounds | None:
@@ -316,12 +321,12 @@ class _Planner:
         if root.task.has_pseudo_reward:
             return FlatBound(None, None, "the root has a reward of its own")
         self.tell("flat bound", "parameterise")
-        process = flat_process(
-            self.symbolic, reachable=self.reachable, terminal=root.reduction.process.terminal
-        )
         try:
+            process = flat_process(
+                self.symbolic, reachable=self.reachable, terminal=root.reduction.process.terminal
+            )
             reduction = self.reduce("flat bound", process, limit)
-        except LimitReached as error:
+        except (LimitReached, MemoryLimit, Aborted) as error:
             return FlatBound(None, None, f"left out: {error}")
         pomdp = reduction.pomdp_quotient.pomdp
         self.tell("flat bound", "solve", 0, pomdp.states)
@@ -358,6 +363,8 @@ def belief_policy(solution: POMDPSolution) -> BeliefPolicy:
 def task_warnings(task: Task, solution: POMDPSolution, *, is_child: bool) -> tuple[str, ...]:
     """What a person should know of a solved task."""
     found = []
+    if solution.status in ("time limit", "memory limit"):
+        found.append(cut_short_text(task.name, solution.status, solution.gap))
     if is_child and solution.guarantee.kind == "heuristic":
         found.append(
             f"task {task.name!r}: {solution.method} proves no lower bound; its parents take its word for "

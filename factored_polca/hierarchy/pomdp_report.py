@@ -12,13 +12,16 @@ from factored_polca.hierarchy.pomdp_solved import SolvedPomdpTask
 from factored_polca.hierarchy.solved import StructuredTask
 
 
-def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) -> dict[str, Any]:
+def pomdp_plan_report(
+    plan: PomdpPlan, polca: HierarchicalPlan | None = None, *, list_states: bool = True
+) -> dict[str, Any]:
     """Figures of a plan: the tasks children first, and what no policy can exceed.
 
-    `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.
+    `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.  The
+    number without abstraction takes listing all states, which `list_states` may forbid.
     """
     processes = [solved.reduction.process for solved in plan.solved]
-    none = unreduced_parameters(plan.symbolic, processes)
+    none = unreduced_parameters(plan.symbolic, processes) if list_states else None
     tasks = [
         task_report(solved)
         | {
@@ -34,6 +37,7 @@ def pomdp_plan_report(plan: PomdpPlan, polca: HierarchicalPlan | None = None) ->
         "model": plan.model.name,
         "states": plan.model.states,
         "method": "PolCA+",
+        "status": plan.status,
         "discount": float(plan.model.discount),
         "flat_upper": plan.flat.upper,
         "flat_blocks": plan.flat.blocks,
@@ -103,8 +107,9 @@ def guarantee(plan: PomdpPlan) -> str:
     chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
     if plan.root.approximation is not None:
         return merging_text(plan.root.approximation, plan.certified)
+    certified = plan.certified is not None and plan.certified.polled_lower is not None
     return (
         "each task's bounds hold in its own model, given what its children do where they are certain; what "
-        "the polled policy earns is measured; each partition exact but for a chance below "
-        f"{max(chance, 1e-300):.1g}"
+        f"the polled policy earns is measured{' and certified' if certified else ''}; each partition exact "
+        f"but for a chance below {max(chance, 1e-300):.1g}"
     )

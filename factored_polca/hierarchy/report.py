@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from factored_polca.hierarchy.counts import total_counts
 from factored_polca.hierarchy.irrelevance import KINDS, value_classes
 from factored_polca.hierarchy.merging import approximation_report, merging_report, merging_text
-from factored_polca.hierarchy.plan import HierarchicalPlan, total_counts
+from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.hierarchy.solved import AnySolvedTask, StructuredTask
 from factored_polca.minimisation.reduction import InterchangeableReduction
 
@@ -17,6 +18,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
     return {
         "model": plan.model.name,
         "states": plan.model.states,
+        "status": plan.status,
         "value": plan.polled.value,
         "value_bounds": [plan.polled.lower, plan.polled.upper],
         "flat_value": None if plan.flat is None else plan.flat.value,
@@ -37,6 +39,7 @@ def plan_report(plan: HierarchicalPlan) -> dict[str, Any]:
                 "value_classes": classes_by_kind(solved),
                 "value": solved.value,
                 "solver": solved.method,
+                "status": solved.status,
                 "gap": solved.gap,
                 "ties": solved.ties,
                 "dead_end_states": solved.dead_end_states,

@@ -1,7 +1,7 @@
 """A solved subtask: what solved it, over blocks or on diagrams, and its policy as a diagram.
 
 Both kinds tell their parents, the report and execution the same: `process`, `policy`, `defined`, `value`,
-`blocks`, `counts`, `method`, `gap`, `ties`, `seconds` and `warnings`.
+`blocks`, `counts`, `method`, `gap`, `status`, `ties`, `seconds` and `warnings`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from factored_polca.hierarchy.counts import QValueCounts
 from factored_polca.minimisation import DecisionProcess, Reduction
 from factored_polca.models import Task
 from factored_polca.solvers import MDPSolution
+from factored_polca.solvers.result import Status
 from factored_polca.structured.solution import StructuredSolution
 
 
@@ -70,6 +71,11 @@ class SolvedTask(DrawnGraph):
     def gap(self) -> float:
         """The largest upper - lower of a state."""
         return self.solution.gap
+
+    @property
+    def status(self) -> Status:
+        """Why the solver stopped."""
+        return self.solution.status
 
     @property
     def ties(self) -> int:
@@ -144,6 +150,11 @@ class StructuredTask(DrawnGraph):
     def gap(self) -> float:
         """The largest upper - lower of a state."""
         return self.solution.gap
+
+    @property
+    def status(self) -> Status:
+        """Why the solver stopped."""
+        return self.solution.status
 
     @property
     def ties(self) -> None:

@@ -58,9 +58,14 @@ def can_fall_back(error: LimitReached, strict: bool) -> bool:
 
 
 def on_diagrams(
-    name: str, process: DecisionProcess, options: Options, progress: Progress | None = None
+    name: str,
+    process: DecisionProcess,
+    options: Options,
+    progress: Progress | None = None,
+    *,
+    search_until: float | None = None,
 ) -> StructuredSolution:
-    """A process solved on diagrams, as the options ask.
+    """A process solved on diagrams, as the options ask; what is cut short at `search_until` is returned.
 
     Raises:
         ModelError: see `structured_value_iteration`.
@@ -68,11 +73,12 @@ def on_diagrams(
         KeyboardInterrupt: Ctrl-C.
     """
     solution = structured_value_iteration(
-        process, epsilon=options.epsilon, deadline=options.deadline, progress=progress
-    )
+        process, epsilon=options.epsilon, progress=progress,
+        deadline=options.deadline if search_until is None else search_until,
+    )  # fmt: skip
     if solution.status == "interrupted":
         raise KeyboardInterrupt
-    if solution.status == "time limit":
+    if solution.status == "time limit" and search_until is None:
         raise LimitReached(
             f"task {name!r}: the time limit was reached in sweep {solution.iterations + 1} of structured "
             f"value iteration (value between {solution.lower:.6g} and {solution.upper:.6g})",
@@ -88,6 +94,8 @@ def solve_on_diagrams(
     options: Options,
     reason: str,
     progress: Progress | None = None,
+    *,
+    search_until: float | None = None,
 ) -> StructuredTask:
     """A subtask solved without a quotient; `reason` says why.
 
@@ -97,7 +105,7 @@ def solve_on_diagrams(
     """
     began = time.perf_counter()
     refuse_without_purpose_on_diagrams(task, process)
-    solution = on_diagrams(task.name, process, options, progress)
+    solution = on_diagrams(task.name, process, options, progress, search_until=search_until)
     symbolic = process.symbolic
     counts = dict(
         zip(leaves(solution.lost), states_of_leaves(solution.lost, symbolic.now_levels), strict=True)

@@ -34,13 +34,16 @@ from factored_polca.diagrams import Diagram, evaluate_states
 from factored_polca.drawn import Drawn, Framed
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray
 from factored_polca.explicit.belief import ImpossibleObservation
-from factored_polca.models import ModelError
+from factored_polca.models import LimitReached, ModelError
 from factored_polca.simulation.sampler import Sampler, States
 from factored_polca.simulation.simulate import default_steps
 from factored_polca.symbolic import SymbolicModel, Term
 
 Progress = Callable[[int, int], None]
-"""Called at each step with the number of the first episode of those that run, and the step, both from 0."""
+"""Called at each step with the number of the first episode of those that run, and the step, both from 0.
+
+It may raise `LimitReached`: episodes then end as they are, but for those that have not taken a step.
+"""
 
 EPISODES: Final = 1000
 """Episodes that are run where nobody asks for another number."""
@@ -105,6 +108,7 @@ def run_on_blocks(
     steps: int | None = None,
     seed: int = 0,
     stage: Stage | None = None,
+    progress: Progress | None = None,
 ) -> BeliefRuns:
     """Run a policy over beliefs on the original model.
 
@@ -122,6 +126,7 @@ def run_on_blocks(
         steps=steps,
         seed=seed,
         at_once=max(1, BELIEF_NUMBERS // tracker.partition.blocks),
+        progress=progress,
     )
 
 
@@ -163,6 +168,7 @@ def run_episodes(
     Raises:
         ValueError: fewer than one episode or step.
         ModelError: the policy has no action at a belief of an episode that goes on.
+        LimitReached: of `progress`, before the first step.
     """
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError("episodes and steps must be at least 1")
@@ -174,8 +180,13 @@ def run_episodes(
     for first in range(0, episodes, at_once):
         count = min(at_once, episodes - first)
         tell = None if progress is None else partial(progress, first)
-        _run(world, minds(count), count, length, discount, generator, total, tell)
-    return total.runs(episodes, length, discount)
+        try:
+            _run(world, minds(count), count, length, discount, generator, total, tell)
+        except LimitReached:
+            if not total.returns:
+                raise
+            break
+    return total.runs(discount)
 
 
 class World:
@@ -274,18 +285,21 @@ class _Total:
 
     def __init__(self, steps: int, actions: int) -> None:
         self.returns: list[FloatArray] = []
+        self.steps = steps
         self.sums, self.squares = np.zeros(steps), np.zeros(steps)
         self.counts = np.zeros(actions, dtype=np.int64)
         self.ended, self.largest, self.resets = 0, 0.0, 0
 
-    def runs(self, episodes: int, steps: int, discount: float) -> BeliefRuns:
+    def runs(self, discount: float) -> BeliefRuns:
+        steps, returns = self.steps, np.concatenate(self.returns)
+        episodes = len(returns)
         mean = self.sums / episodes
         variance = np.maximum(0.0, self.squares - episodes * mean**2) / max(1, episodes - 1)
         left = 0.0 if self.ended == episodes else math.inf
         if left and discount < 1:
             left = discount**steps / (1 - discount) * self.largest
         return BeliefRuns(
-            np.concatenate(self.returns), steps, self.ended, left, mean, np.sqrt(variance / episodes),
+            returns, steps, self.ended, left, mean[:steps], np.sqrt(variance / episodes)[:steps],
             self.counts, self.resets,
         )  # fmt: skip
 
@@ -308,7 +322,15 @@ def _run(
     for step in range(length):
         if len(going):
             if tell is not None:
-                tell(step)
+                try:
+                    tell(step)
+                except LimitReached:
+                    if not step:
+                        raise
+                    total.sums[step:] += cumulative.sum()
+                    total.squares[step:] += (cumulative**2).sum()
+                    total.steps = min(total.steps, step)
+                    break
             actions = np.full(count, -1, dtype=np.int64)
             actions[going] = minds.choose(going)
             if (actions[going] < 0).any():

@@ -7,20 +7,22 @@ tracked, under its own reward, until it has ended.  A task without children is n
 hold as they are, so only the root is measured in any case.
 
 Where beliefs are not tracked over blocks, episode is tracked by episode, which takes long, and only the
-root is measured.
+root is measured.  Where time is up, what is not finished is left out.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 
 from factored_polca.control.belief_controller import BeliefController, plan_tracker
 from factored_polca.control.belief_policies import PolledPolicy
 from factored_polca.control.block_tracker import BlockTracker
 from factored_polca.control.tracker import ChosenTracker
 from factored_polca.hierarchy.pomdp_executable import ExecutablePomdpPlan
+from factored_polca.models import LimitReached
 from factored_polca.simulation import belief_episodes, belief_runs
 from factored_polca.simulation.belief_episodes import run_one_by_one
 from factored_polca.simulation.belief_runs import BeliefRuns, Stage, run_on_blocks
@@ -28,7 +30,8 @@ from factored_polca.simulation.belief_runs import BeliefRuns, Stage, run_on_bloc
 
 @dataclass(frozen=True)
 class Measurement:
-    """The runs of each measured task by name, and the tracker that they used."""
+    """The runs of each measured task by name, and the tracker that they used; tasks that time ended are not
+    among them."""
 
     runs: Mapping[str, BeliefRuns]
     tracker: ChosenTracker
@@ -43,34 +46,50 @@ def measure(
     seed: int = 0,
     chosen: ChosenTracker | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    deadline: float | None = None,
 ) -> Measurement:
     """Run the root of a plan for `episodes`, other tasks with children for `child_episodes` each.
 
     Without a number the root is run for `belief_runs.EPISODES`, or where beliefs are tracked one by one for
     `belief_episodes.EPISODES`.
-    `progress` is called with the task, the first of the episodes that run, and the step, where they are
-    tracked one by one.
+    `progress` is called with the task, the first of the episodes that run, and the step.  At `deadline`, a
+    reading of `time.monotonic()`, the run of a task is given up.
     """
-    chosen = plan_tracker(plan, seed=seed, on_impossible="reset") if chosen is None else chosen
+
+    def watch(task: str) -> Callable[[int, int], None]:
+        def step(first: int, number: int) -> None:
+            if deadline is not None and time.monotonic() > deadline:
+                raise LimitReached("the time limit was reached", "measure")
+            if progress is not None:
+                progress(task, first, number)
+
+        return step
+
+    if chosen is None:
+        chosen = plan_tracker(plan, seed=seed, on_impossible="reset", deadline=deadline)
     tracker = chosen.tracker
     if not isinstance(tracker, BlockTracker):
         controller = BeliefController(plan)
-        run = run_one_by_one(
-            tracker,
-            lambda belief: controller.poll(belief).number,
-            episodes=belief_episodes.EPISODES if episodes is None else episodes,
-            steps=steps,
-            seed=seed,
-            progress=None if progress is None else partial(progress, plan.root),
-        )
-        return Measurement({plan.root: run}, chosen)
-    runs, root_episodes = {}, belief_runs.EPISODES if episodes is None else episodes
-    for name, task in plan.policies.items():
+        with suppress(LimitReached):
+            run = run_one_by_one(
+                tracker,
+                lambda belief: controller.poll(belief).number,
+                episodes=belief_episodes.EPISODES if episodes is None else episodes,
+                steps=steps,
+                seed=seed,
+                progress=watch(plan.root),
+            )
+            return Measurement({plan.root: run}, chosen)
+        return Measurement({}, chosen)
+    runs, root_episodes = dict[str, BeliefRuns](), belief_runs.EPISODES if episodes is None else episodes
+    for name, task in reversed(list(plan.policies.items())):  # the root first
         if name != plan.root and not any(action in plan.policies for action in task.actions):
             continue
-        stage = None if name == plan.root else Stage(task.ended, plan.process(name).rewards)
+        stage = None if name == plan.root else Stage(task.ended, plan.rewards(name))
         count = root_episodes if name == plan.root or child_episodes is None else child_episodes
-        runs[name] = run_on_blocks(
-            tracker, PolledPolicy(plan, tracker, name), episodes=count, steps=steps, seed=seed, stage=stage
-        )
-    return Measurement(runs, chosen)
+        with suppress(LimitReached):
+            runs[name] = run_on_blocks(
+                tracker, PolledPolicy(plan, tracker, name), episodes=count, steps=steps, seed=seed,
+                stage=stage, progress=watch(name),
+            )  # fmt: skip
+    return Measurement(dict(reversed(list(runs.items()))), chosen)

@@ -33,8 +33,7 @@ from factored_polca.baselines.learning import CLOSE, optimal_values
 from factored_polca.baselines.process import MAXIMUM_STATES
 from factored_polca.drawn import Framed
 from factored_polca.hierarchy import Options, plan_mdp
-from factored_polca.hierarchy.counts import QValueCounts
-from factored_polca.hierarchy.plan import total_counts
+from factored_polca.hierarchy.counts import QValueCounts, total_counts
 from factored_polca.models import LimitReached, ModelError
 from factored_polca.studies.parameters import Progress, silent
 
