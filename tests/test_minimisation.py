@@ -32,10 +32,10 @@ from factored_polca.minimisation import (
     reduce,
     refine,
 )
+from factored_polca.minimisation.collision import difference_bits
 from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.minimisation.quotient import exact_initial_distribution
 from factored_polca.minimisation.race import Race
-from factored_polca.minimisation.refine import difference_bits
 from factored_polca.models import (
     Action,
     Constant,
