@@ -124,7 +124,9 @@ def state_list(view: ProcessView, labels: Diagram) -> StateList | None:
         for choice in process.choices
         for p in choice.primitives
     }
-    entries = prod(sizes) * sum(max(longest[p] for p in choice.primitives) for choice in process.choices)
+    entries = prod(sizes) * sum(
+        max((longest[p] for p in choice.primitives), default=0) for choice in process.choices
+    )
     found = StateList(features, sizes, entries)
     if entries > MAXIMUM_ENTRIES or manager.bytes + found.bytes > manager.memory_limit:
         return None
@@ -162,7 +164,7 @@ class ListedRefinement:
         self._labels: Diagram | None = labels
         self.block = self._evaluate(labels)
         blocks, states = int(self.block.max()) + 1, listed.states
-        self._list_entries(draw(len(view.process.choices)))
+        self._list_entries(draw)
         self.elements = draw(states)
         self.state = np.array([states, blocks, 0], dtype=np.int64)
         self.order = np.argsort(self.block, kind="stable").astype(np.int32)
@@ -191,16 +193,17 @@ class ListedRefinement:
             result[low : low + CHUNK] = evaluate_states(diagram, table[: len(numbers)], columns)
         return result
 
-    def _list_entries(self, factors: UInt64Array) -> None:
-        """M by columns; `factors` are s_c."""
-        listed, manager, choices = self.listed, self.manager, self.view.process.choices
+    def _list_entries(self, draw: Callable[[int], UInt64Array]) -> None:
+        """M by columns."""
+        listed, manager = self.listed, self.manager
+        choices = [choice for choice in self.view.process.choices if choice.primitives]
         features = len(self.symbolic.model.features)
         draws = _Draws(self.view, listed)
         masks = [self.view.app(choice) for choice in choices]
         apps = np.array([mask.node for mask in masks], dtype=np.int32)
         policies = np.array([0 if c.policy is None else c.policy.node for c in choices], dtype=np.int32)
         single = np.array([choice.primitives[0] for choice in choices], dtype=np.int64)
-        states = listed.states
+        factors, states = draw(len(choices)), listed.states
         first = np.zeros(states + 1, dtype=np.int64)
         room = min(listed.entries, 4 * states + 1024)
         target, weight = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.uint64)
