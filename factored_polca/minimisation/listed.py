@@ -18,7 +18,7 @@ then lists are tried (as with renting skis: no more than about twice the time of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
 
@@ -38,7 +38,7 @@ from factored_polca.minimisation.listed_kernel import (
     refine_listed,
     transpose,
 )
-from factored_polca.minimisation.outcomes import make_draw
+from factored_polca.minimisation.outcomes import FlatDraws, make_draw
 from factored_polca.minimisation.propagation import UNLIMITED, TooManyBlocks
 from factored_polca.symbolic.forward import join_items
 
@@ -285,10 +285,10 @@ class ListedRefinement:
         return self.blocks > before
 
 
-class _Draws:
-    """The draws of the relevant features, primitive after primitive, as `draws_kernel` takes them.
+class _Draws(FlatDraws):
+    """The draws of the relevant features, primitive after primitive.
 
-    `local` [action] is the place of a primitive, `first` [place] its first draw.
+    `local` [action] is the place of a primitive, `residue` [entry] the probabilities in the field.
     """
 
     def __init__(self, view: ProcessView, listed: StateList) -> None:
@@ -297,25 +297,14 @@ class _Draws:
         primitives = sorted({p for choice in view.process.choices for p in choice.primitives})
         self.local = np.zeros(len(symbolic.actions) + 1, dtype=np.int64)
         self.local[primitives] = np.arange(len(primitives))
-        first: list[int] = [0]
-        draws, residues = [], []
-        for p in primitives:
-            action = symbolic.actions[p]
-            for i in reversed(action.elimination):
-                if i in action.rows and i in listed.features:
-                    draws.append(make_draw(action.rows[i], features + i))
-                    residues += [q for row in action.rows[i].rows for q in row if q]
-            first.append(len(draws))
-        self.first = np.array(first, dtype=np.int64)
-        self.roots = np.array([draw.row.diagram.node for draw in draws], dtype=np.int32)
-        self.targets = np.array([draw.column for draw in draws], dtype=np.int32)
-        rows = [len(draw.start) for draw in draws]
-        self.bases = (np.cumsum([0, *rows])[:-1]).astype(np.int64)
-        before = np.cumsum([0, *(len(draw.value) for draw in draws)])
-        self.start = _joined([draw.start + shift for draw, shift in zip(draws, before, strict=False)])
-        self.value = np.array([v for draw in draws for v in draw.value.tolist()], dtype=np.int32)
-        self.residue = view.numbers.stored(residues).astype(np.uint64)
-
-
-def _joined(arrays: Sequence[Int64Array]) -> Int64Array:
-    return np.concatenate([*arrays, np.empty(0, dtype=np.int64)]).astype(np.int64)
+        drawn = [
+            [
+                action.rows[i]
+                for i in reversed(action.elimination)
+                if i in action.rows and i in listed.features
+            ]
+            for action in (symbolic.actions[p] for p in primitives)
+        ]
+        super().__init__([[make_draw(row, features + row.feature) for row in rows] for rows in drawn])
+        entries = [q for rows in drawn for row in rows for chances in row.rows for q in chances if q]
+        self.residue = view.numbers.stored(entries).astype(np.uint64)
