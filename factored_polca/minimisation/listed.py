@@ -40,6 +40,7 @@ from factored_polca.minimisation.listed_kernel import (
 )
 from factored_polca.minimisation.outcomes import FlatDraws, make_draw
 from factored_polca.minimisation.propagation import UNLIMITED, TooManyBlocks
+from factored_polca.symbolic import SymbolicModel
 from factored_polca.symbolic.forward import join_items
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -133,6 +134,39 @@ def state_list(view: ProcessView, labels: Diagram) -> StateList | None:
     return found
 
 
+def evaluate_listed(symbolic: SymbolicModel, listed: StateList, diagram: Diagram) -> UInt64Array:
+    """The payloads of a diagram, over the features listed, at all states [state]."""
+    columns = symbolic.columns()
+    result = np.empty(listed.states, dtype=np.uint64)
+    table = np.zeros((min(CHUNK, listed.states), len(symbolic.model.features)), dtype=np.int32)
+    for low in range(0, listed.states, CHUNK):
+        numbers = np.arange(low, min(low + CHUNK, listed.states))
+        for feature, size, stride in zip(listed.features, listed.sizes, listed.strides, strict=True):
+            table[: len(numbers), feature] = numbers // stride % size
+        result[low : low + CHUNK] = evaluate_states(diagram, table[: len(numbers)], columns)
+    return result
+
+
+@dataclass(frozen=True)
+class ListedPartition:
+    """A partition as a diagram and as a list: `block` [state]."""
+
+    symbolic: SymbolicModel
+    listed: StateList
+    diagram: Diagram
+    block: Int32Array
+
+    def is_split_by(self, function: Diagram) -> bool:
+        """Whether a function may differ within a block; it surely does unless it reads other features."""
+        levels = {self.symbolic.now(feature) for feature in self.listed.features}
+        if not levels.issuperset(support(function)):
+            return True
+        values = evaluate_listed(self.symbolic, self.listed, function)
+        some = np.empty(int(self.block.max()) + 1, dtype=np.uint64)
+        some[self.block] = values
+        return not np.array_equal(values, some[self.block])
+
+
 class ListedRefinement:
     """Refines a partition on a list of states; used as `propagation.Propagation` is.
 
@@ -143,6 +177,7 @@ class ListedRefinement:
         draw: makes so many random elements, in stored form.
         allowed: stop beyond so many blocks.
         look: called now and then with the passes so far and the blocks.
+        known: `labels` as a list, if there is one.
     """
 
     def __init__(
@@ -154,6 +189,7 @@ class ListedRefinement:
         *,
         allowed: int | None = None,
         look: Callable[[int, int], None] | None = None,
+        known: ListedPartition | None = None,
     ) -> None:
         field = view.numbers.leaf_type
         assert isinstance(field, Field)
@@ -162,7 +198,10 @@ class ListedRefinement:
         self.symbolic = view.process.symbolic
         self.allowed = UNLIMITED if allowed is None else allowed
         self._labels: Diagram | None = labels
-        self.block = self._evaluate(labels)
+        if known is None or known.listed != listed or known.diagram != labels:
+            self.block = evaluate_listed(self.symbolic, listed, labels).astype(np.int32)
+        else:
+            self.block = known.block.copy()
         blocks, states = int(self.block.max()) + 1, listed.states
         self._list_entries(draw)
         self.elements = draw(states)
@@ -180,18 +219,6 @@ class ListedRefinement:
         self.met, self.hits = np.zeros((2, states), dtype=np.int32)
         self.touched, self.blocks_hit = np.empty((2, states), dtype=np.int32)
         self.stack = np.zeros(160, dtype=np.int64)
-
-    def _evaluate(self, diagram: Diagram) -> Int32Array:
-        """An index diagram at all states listed [state]."""
-        listed, columns = self.listed, self.symbolic.columns()
-        result = np.empty(listed.states, dtype=np.int32)
-        table = np.zeros((min(CHUNK, listed.states), len(self.symbolic.model.features)), dtype=np.int32)
-        for low in range(0, listed.states, CHUNK):
-            numbers = np.arange(low, min(low + CHUNK, listed.states))
-            for feature, size, stride in zip(listed.features, listed.sizes, listed.strides, strict=True):
-                table[: len(numbers), feature] = numbers // stride % size
-            result[low : low + CHUNK] = evaluate_states(diagram, table[: len(numbers)], columns)
-        return result
 
     def _list_entries(self, draw: Callable[[int], UInt64Array]) -> None:
         """M by columns."""
@@ -248,6 +275,11 @@ class ListedRefinement:
             items = [np.arange(prod(listed.sizes[: i + 1]), dtype=np.int32) for i in range(len(levels))]
             self._labels = join_items(manager, levels, items, leaves[self.block], INDEX)
         return self._labels
+
+    @property
+    def partition(self) -> ListedPartition:
+        """The partition so far; no more passes may follow."""
+        return ListedPartition(self.symbolic, self.listed, self.labels, self.block)
 
     @property
     def blocks(self) -> int:

@@ -65,7 +65,7 @@ from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.drawn import Drawn, Framed
 from factored_polca.minimisation.collision import collision_bound
 from factored_polca.minimisation.criterion import DecisionProcess, ProcessView, common_denominator
-from factored_polca.minimisation.listed import ListedRefinement, StateList, state_list
+from factored_polca.minimisation.listed import ListedPartition, ListedRefinement, StateList, state_list
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
 from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagation, TooManyBlocks
@@ -181,6 +181,7 @@ class _Refinement:
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | ListedRefinement | None = None
         self.listed: StateList | None = None
+        self.as_list: ListedPartition | None = None
         self.race = Race()
         self.cuts: Cuts = {}
         self.denominator = common_denominator(process)
@@ -353,8 +354,9 @@ class _Refinement:
         if self.listed is not None:
             try:
                 return ListedRefinement(
-                    self.view, self.listed, self.labels.diagram, draw, allowed=allowed, look=look
-                )
+                    self.view, self.listed, self.labels.diagram, draw, allowed=allowed, look=look,
+                    known=self.as_list,
+                )  # fmt: skip
             except MemoryError:
                 self.listed = None
         return Propagation(
@@ -364,6 +366,7 @@ class _Refinement:
 
     def keep(self, propagation: Propagation | ListedRefinement) -> None:
         """The partition that it has come to."""
+        self.as_list = propagation.partition if isinstance(propagation, ListedRefinement) else None
         self.labels = _Labels(propagation.labels, propagation.elements[: propagation.blocks])
 
     def report(self, rounds: int, labels: int) -> None:
@@ -374,6 +377,9 @@ class _Refinement:
     def split(self, by: Diagram) -> None:
         """Replace the partition by the distinct pairs (block, leaf of `by`)."""
         if by.is_constant:
+            return
+        known = self.as_list
+        if known is not None and known.diagram == self.labels.diagram and not known.is_split_by(by):
             return
         numbered, old_leaf, _ = pairs(self.labels.diagram, by)
         old = leaf_payloads(self.manager, old_leaf).astype(np.int64)
