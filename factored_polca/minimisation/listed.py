@@ -5,10 +5,8 @@ each value of its variable, and a block that is split costs a node at each level
 on arrays (`factored_polca.minimisation.listed_kernel`), in GF(p) as well: what is random and what is exact,
 what the passes are and what comes of them does not change.
 
-What is listed are the value combinations of the *relevant* features: those that the partition tests, that
-tell where choices apply and what they stand for, and that rows of their primitives read which give a
-relevant feature its next value.  Other features do not change what is sent to blocks, since rows sum to
-exactly 1.  With n_i values of feature i and at most e_pi positive entries in its rows of primitive p,
+What is listed are the value combinations of the relevant features (`factored_polca.minimisation.apart`).
+With n_i values of feature i and at most e_pi positive entries in its rows of primitive p,
 
     states N = prod_i n_i,      entries <= N * sum over choices of max over their p of prod_i e_pi.
 
@@ -27,6 +25,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams import INDEX, Diagram, Field, Manager, evaluate_states, support
 from factored_polca.diagrams.nodes import DONE, YIELDED, Int32Array, Int64Array
+from factored_polca.minimisation.apart import relevant_features
 from factored_polca.minimisation.criterion import ProcessView
 from factored_polca.minimisation.listed_kernel import (
     BLOCKS,
@@ -98,24 +97,10 @@ def state_list(view: ProcessView, labels: Diagram) -> StateList | None:
     symbolic, manager = process.symbolic, labels.manager
     if view.sensed is not None or not process.choices:
         return None
-    count = len(symbolic.model.features)
-    feature_at = {level: i for i in range(count) for level in (symbolic.now(i), symbolic.next(i))}
-    relevant: set[int] = set()
-    waiting = {feature_at[level] for level in support(labels)}
-    for choice in process.choices:
-        read = [view.app(choice), *([] if choice.policy is None else [choice.policy])]
-        waiting |= {feature_at[level] for diagram in read for level in support(diagram)}
-    actions = [symbolic.actions[p] for p in {p for choice in process.choices for p in choice.primitives}]
-    while waiting:
-        feature = waiting.pop()
-        relevant.add(feature)
-        rows = [action.rows[feature] for action in actions if feature in action.rows]
-        read_by_rows = {feature_at[level] for row in rows for level in support(row.diagram)}
-        waiting |= read_by_rows - relevant
-        if prod(manager.sizes[symbolic.now(i)] for i in relevant) > MAXIMUM_STATES:
-            return None
-    features = tuple(sorted(relevant, key=symbolic.now))
+    features = tuple(relevant_features(view, labels))
     sizes = tuple(manager.sizes[symbolic.now(i)] for i in features)
+    if prod(sizes) > MAXIMUM_STATES:
+        return None
     longest = {
         p: prod(
             max(sum(q != 0 for q in row) for row in symbolic.actions[p].rows[i].rows)

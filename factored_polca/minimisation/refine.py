@@ -9,6 +9,9 @@ regression through choice c, masked.
     3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a
        split there sends the refinement on with that prime.
 
+No confirming pass is needed where no two states are left that could differ: such a partition is stable
+with certainty (`factored_polca.minimisation.apart`).
+
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
 the first `EARLY` passes after the first one are confirming passes: one without a split is the last.
 
@@ -63,6 +66,7 @@ from factored_polca.diagrams import (
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.drawn import Drawn, Framed
+from factored_polca.minimisation.apart import all_apart
 from factored_polca.minimisation.collision import collision_bound
 from factored_polca.minimisation.criterion import DecisionProcess, ProcessView, common_denominator
 from factored_polca.minimisation.listed import ListedPartition, ListedRefinement, StateList, state_list
@@ -84,7 +88,7 @@ class Minimisation(Drawn, Framed):
     """A partition and how it was found.
 
     `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the
-    probability that the partition is coarser than the coarsest stable one.
+    probability that the partition is coarser than the coarsest stable one (0: it is not).
     """
 
     process: DecisionProcess
@@ -150,6 +154,8 @@ def minimise(
             refinement.partition_so_far(),
         ) from None
     bound = collision_bound(process, interchangeable) ** confirmations * refinement.attempts
+    if refinement.certain:
+        bound = 0.0
     seconds = time.perf_counter() - start
     primes = tuple(refinement.primes)
     return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
@@ -177,6 +183,7 @@ class _Refinement:
         self.progress = progress
         self.rounds = 0
         self.attempts = 0
+        self.certain = False
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | ListedRefinement | None = None
@@ -223,7 +230,7 @@ class _Refinement:
         self.begin()
         self.one_pass()
         passed = 0
-        while passed < confirmations:
+        while passed < confirmations and not self.is_certain():
             self.use(Field(self.fresh_prime()))
             before = self.labels.blocks
             self.split_rewards()  # the rest of the beginning knows no numbers
@@ -234,6 +241,13 @@ class _Refinement:
                     self.refine()
             else:
                 passed += 1
+
+    def is_certain(self) -> bool:
+        """Whether the partition is stable since no two states are left that could differ."""
+        self.certain = not self.interchangeable and all_apart(
+            self.view, self.labels.diagram, self.labels.blocks
+        )
+        return self.certain
 
     def fresh_prime(self) -> int:
         """A random prime not used yet that divides no denominator of the model."""
