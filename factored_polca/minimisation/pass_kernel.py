@@ -66,7 +66,7 @@ blocks are more than allowed."""
 CHOICE, STEP, PLACE = range(3)
 """Places in `progress`."""
 
-GROUP = 16
+GROUP = 32
 """Terms that are summed up at once: the cache soon forgets longer sums, whose keys fill it."""
 
 
