@@ -10,7 +10,7 @@ regression through choice c, masked.
        split there sends the refinement on with that prime.
 
 No confirming pass is needed where no two states are left that could differ: such a partition is stable
-with certainty (`factored_polca.minimisation.apart`).
+with certainty (`factored_polca.minimisation.apart`), and the bound, as reported, too large.
 
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
 the first `EARLY` passes after the first one are confirming passes: one without a split is the last.
@@ -88,7 +88,7 @@ class Minimisation(Drawn, Framed):
     """A partition and how it was found.
 
     `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the
-    probability that the partition is coarser than the coarsest stable one (0: it is not).
+    probability that the partition is coarser than the coarsest stable one.
     """
 
     process: DecisionProcess
@@ -153,9 +153,7 @@ def minimise(
             "minimisation",
             refinement.partition_so_far(),
         ) from None
-    bound = collision_bound(process, interchangeable) ** confirmations * refinement.attempts
-    if refinement.certain:
-        bound = 0.0
+    bound = collision_bound(process, interchangeable) ** confirmations * max(1, refinement.attempts)
     seconds = time.perf_counter() - start
     primes = tuple(refinement.primes)
     return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
@@ -183,7 +181,6 @@ class _Refinement:
         self.progress = progress
         self.rounds = 0
         self.attempts = 0
-        self.certain = False
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
         self.propagation: Propagation | ListedRefinement | None = None
@@ -244,10 +241,7 @@ class _Refinement:
 
     def is_certain(self) -> bool:
         """Whether the partition is stable since no two states are left that could differ."""
-        self.certain = not self.interchangeable and all_apart(
-            self.view, self.labels.diagram, self.labels.blocks
-        )
-        return self.certain
+        return not self.interchangeable and all_apart(self.view, self.labels.diagram, self.labels.blocks)
 
     def fresh_prime(self) -> int:
         """A random prime not used yet that divides no denominator of the model."""
