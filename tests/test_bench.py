@@ -40,6 +40,15 @@ def test_cases_are_chosen_by_parts_of_their_names() -> None:
         chosen(["tiger"], False)
 
 
+def test_large_cases_run_only_where_they_are_asked_for() -> None:
+    assert [case.name for case in chosen(["taxi 2", "taxi 128"], False)] == ["taxi 20", "taxi 128"]
+    assert "taxi 256" not in [case.name for case in chosen(["taxi"], False)]
+    assert {case.name for case in chosen([], False, True) if case.large} == {
+        *("expon 16", "expon 17", "expon 18"), *("taxi 128", "taxi 256"),
+        *(f"sysadmin ring {n}" for n in (16, 18, 20)),
+    }  # fmt: skip
+
+
 def test_dyadic_probabilities_are_fractions_of_the_denominator_and_none_is_lost() -> None:
     model = library.load("components", {"size": "2"}).model
     exact = enumerate_model(dyadic(model, 8))
@@ -93,11 +102,12 @@ def test_a_row_shows_the_quicker_peer_and_the_ratio() -> None:
 
 def test_growth_is_fitted_where_a_family_has_points_enough() -> None:
     family = [case for case in CASES if case.family == "expon"][:3]
-    rows = [row(case, 0.001 * 2**case.size, 2**case.size) for case in family]
+    rows = [row(case, 0.001 * 2**case.size, 2**case.size, actions=7) for case in family]
     assert growths(rows[:2]) == []
     (line,) = growths(rows)
     assert line.startswith("expon: seconds 2^n")
     assert "blocks 2^n" in line
+    assert "seconds (blocks x actions)^1.00" in line
     assert "Growth, fitted" in markdown(rows)
 
 

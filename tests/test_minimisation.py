@@ -32,10 +32,10 @@ from factored_polca.minimisation import (
     reduce,
     refine,
 )
+from factored_polca.minimisation.collision import difference_bits
 from factored_polca.minimisation.criterion import policy_primitives
 from factored_polca.minimisation.quotient import exact_initial_distribution
 from factored_polca.minimisation.race import Race
-from factored_polca.minimisation.refine import difference_bits
 from factored_polca.models import (
     Action,
     Constant,
@@ -117,6 +117,22 @@ def test_a_chain_is_split_state_by_state() -> None:
     assert found.partition.blocks == 40
     assert found.partition.sizes == [2] * 40
     assert found.rounds > 36
+
+
+@pytest.mark.parametrize("telling", [0, 31, 32, 63, 64, 69])
+def test_one_of_many_actions_is_enough_to_tell_states_apart(telling: int) -> None:
+    """Choices are summed up in groups; x' = y under one of them, so x and y count, and z does not."""
+    x, y, z = boolean("x"), boolean("y"), boolean("z")
+    half = lottery({True: Fraction(1, 2), False: Fraction(1, 2)})
+    actions = [Action(f"a{i}", {x: y if i == telling else half, z: half}) for i in range(70)]
+    symbolic = compile_model(Model("many", [x, y, z], actions, rewards="1 if x else 0"))
+    assert minimise(flat_process(symbolic)).partition.sizes == [2] * 4
+
+
+def test_many_actions_and_long_chains_are_no_trouble() -> None:
+    """`linear`: the flat quotient counts how many conditions hold from the first on, n + 1 blocks."""
+    symbolic = compile_model(load("linear", {"size": "70"}).model)
+    assert minimise(flat_process(symbolic)).partition.blocks == 71
 
 
 @chunks()

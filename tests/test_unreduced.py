@@ -18,7 +18,8 @@ from factored_polca.explicit.enumeration import enumerate_model
 from factored_polca.explicit.exact_pomdp import ExactPOMDP, enumerate_pomdp
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats.native import read_native, write_native
-from factored_polca.minimisation import outcomes
+from factored_polca.library import load
+from factored_polca.minimisation import expansion, outcomes
 from factored_polca.minimisation.flat_model import flat_model
 from factored_polca.minimisation.outcomes import Numbering
 from factored_polca.minimisation.unreduced import unreduced, unreduced_mdp, unreduced_pomdp
@@ -124,7 +125,11 @@ def test_the_reachable_states_are_the_closure_and_keep_their_entries(seeds: rang
 def test_small_pieces_make_the_same_arrays(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     exact, symbolic = case(seed)
     monkeypatch.setattr(outcomes, "CELLS", 20)  # a few rows
+    monkeypatch.setattr(expansion, "PIECE", 3)
     assert_same(unreduced_pomdp(symbolic), exact.to_arrays(), seed)
+    reached = unreduced(symbolic, reachable=True)
+    monkeypatch.undo()
+    assert_same(reached.pomdp, unreduced_pomdp(symbolic, reachable=True), seed)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -279,6 +284,17 @@ def test_few_reachable_states_of_a_huge_product_are_quick_to_list() -> None:
     assert found.pomdp.observed.tolist() == found.states[:, 0].tolist()
     assert found.pomdp.observations == (("last=0", "last=1", "last=2"),)
     assert [matrix.nnz for matrix in found.pomdp.kernel[0]] == [2 * count - 1, 1, 1]
+
+
+def test_states_that_are_found_one_after_the_other_are_quick_to_list() -> None:
+    """`expon` counts through all 2^12 states; a_k keeps or makes x_k where it can: two outcomes if x_0 ..
+    x_{k-1} are true and x_k is not, one else.  That is so in 2^(n-k-1) states, 2^n - 1 over all k."""
+    n = 12
+    symbolic = compile_model(load("expon", {"size": str(n)}).model)
+    found = unreduced(symbolic, reachable=True)
+    assert found.pomdp.states == 2**n
+    assert sum(matrix.nnz for (matrix,) in found.pomdp.kernel) == n * 2**n + 2**n - 1
+    assert_same(found.pomdp, unreduced_pomdp(symbolic))
 
 
 def test_numbers_of_tuples_follow_the_order_of_tuples() -> None:

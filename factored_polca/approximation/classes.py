@@ -39,9 +39,9 @@ from factored_polca.diagrams import (
 )
 from factored_polca.explicit.arrays import BoolArray, FloatArray, IntArray, SparseMatrix
 from factored_polca.minimisation import DecisionProcess, Partition, make_quotient, partition_from
+from factored_polca.minimisation.collision import PRIMES_IN_RANGE, difference_bits
 from factored_polca.minimisation.criterion import ProcessView, common_denominator
 from factored_polca.minimisation.quotient import feature_states
-from factored_polca.minimisation.refine import PRIMES_IN_RANGE, difference_bits
 from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 

@@ -49,6 +49,7 @@ def run(
     return {
         "states": str(model.states),
         "blocks": found.partition.blocks,
+        "actions": len(model.actions),
         "rounds": found.rounds,
         "seconds": done - loaded,
         "compile": compiled - loaded,

@@ -47,6 +47,7 @@ class Row:
     before: int
     problem: str = ""
     peers: tuple[PeerRow, ...] = ()
+    actions: int = 0
 
     @property
     def rate(self) -> float:
@@ -125,6 +126,7 @@ def run_case(case: Case, repeat: int, seconds: float, peers: Sequence[Peer]) -> 
     return Row(
         case, int(first["states"]), first["blocks"], first["rounds"], middle("seconds"), middle("compile"),
         middle("kernels"), int(middle("nodes")), int(middle("memory")), int(middle("before")), "", others,
+        first["actions"],
     )  # fmt: skip
 
 

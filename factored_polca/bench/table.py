@@ -78,9 +78,11 @@ def growths(rows: Sequence[Row]) -> list[str]:
             continue
         seconds = growth([(row.case.size, row.seconds) for row in points])
         blocks = growth([(row.case.size, row.blocks) for row in points])
+        work = growth([(row.blocks * row.actions, row.seconds) for row in points])
         if seconds is not None and blocks is not None:
+            by_work = "" if work is None else f", seconds {work.power.text('(blocks x actions)')}"
             found.append(
-                f"{family}: seconds {seconds.better.text()}, blocks {blocks.better.text()}, "
+                f"{family}: seconds {seconds.better.text()}, blocks {blocks.better.text()}{by_work}, "
                 f"n from {min(row.case.size for row in points)} to {max(row.case.size for row in points)}"
             )
     return found

@@ -20,13 +20,13 @@ from factored_polca.formats.files import write_text
 def bench(arguments: argparse.Namespace, output: Output) -> int:
     """Run the cases that were asked for."""
     try:
-        cases = chosen(arguments.case, arguments.quick)
+        cases = chosen(arguments.case, arguments.quick, arguments.large)
     except ValueError as error:
         raise UsageError(str(error)) from None
     if arguments.list:
         return list_cases(cases, output)
     if not cases:
-        raise UsageError("no case is left; drop --quick")
+        raise UsageError("no case is left; drop --quick, or ask for --large")
     peers = [] if arguments.no_peer else storm_peers()
     if not peers and not arguments.no_peer:
         output.note("without a peer: stormpy is not installed (pip install 'factored-polca[storm]')")

@@ -18,6 +18,7 @@ def add_bench(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("case", metavar="CASE", nargs="*", help="parts of cases' names; all if not given")
     sub.add_argument("--list", action="store_true", help="list the cases and run none")
     sub.add_argument("--quick", action="store_true", help="only those that take a few seconds")
+    sub.add_argument("--large", action="store_true", help="also those with 10^5 to 10^6 blocks")
     sub.add_argument("--repeat", type=counting, default=3, metavar="N", help="repetitions of each (3)")
     sub.add_argument(
         "--time", type=positive, default=600.0, metavar="SECONDS", help="limit for each run (600)"

@@ -61,6 +61,26 @@ def make_draw(row: RowDiagram, column: int) -> Draw:
     )
 
 
+class FlatDraws:
+    """Lists of draws, one list after the other, as `factored_polca.minimisation.draws_kernel` takes them.
+
+    `first` [list] is the number of a list's first draw; the entries of all rows of all draws are `value`
+    and `chance` [entry].
+    """
+
+    def __init__(self, lists: Sequence[Sequence[Draw]]) -> None:
+        draws = [draw for listed in lists for draw in listed]
+        self.first = np.cumsum([0, *map(len, lists)]).astype(np.int64)
+        self.roots = np.array([draw.row.diagram.node for draw in draws], dtype=np.int32)
+        self.targets = np.array([draw.column for draw in draws], dtype=np.int32)
+        self.bases = np.cumsum([0, *(len(draw.start) for draw in draws)])[:-1].astype(np.int64)
+        before = np.cumsum([0, *(len(draw.value) for draw in draws)])[:-1].tolist()
+        starts = [draw.start + shift for draw, shift in zip(draws, before, strict=True)]
+        self.start = np.concatenate([np.empty(0, dtype=np.int64), *starts])
+        self.value = np.concatenate([np.empty(0, dtype=np.int32), *(draw.value for draw in draws)])
+        self.chance = np.concatenate([np.empty(0), *(draw.chance for draw in draws)])
+
+
 def parents_first(rows: Mapping[int, RowDiagram]) -> list[int]:
     """The features of `rows`, each after those whose next values it reads."""
     graph = nx.DiGraph()

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams.descent import FOUND, FRAMES, HEADER, SUMMING, run_descent
-from factored_polca.diagrams.jit import int64, lean_kernel
+from factored_polca.diagrams.jit import inline, int64, lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, Int32Array, Int64Array
 from factored_polca.diagrams.weighted import (
     NORMALISED,
@@ -65,6 +65,28 @@ blocks are more than allowed."""
 
 CHOICE, STEP, PLACE = range(3)
 """Places in `progress`."""
+
+GROUP = 32
+"""Terms that are summed up at once: the cache soon forgets longer sums, whose keys fill it."""
+
+
+@inline
+def next_terms(
+    terms: Int32Array, signatures: Int32Array, factors: Int32Array, count: int, zero: int,
+    progress: Int64Array,
+) -> int:  # fmt: skip
+    """Terms s_c f_c from choice `progress[PLACE]` on, beside `count` there are; how many there are then."""
+    choices = len(factors)
+    while progress[PLACE] < choices and count < GROUP:
+        j = progress[PLACE]
+        if signatures[j] != zero:
+            terms[2 * count] = factors[j]
+            terms[2 * count + 1] = signatures[j]
+            count += 1
+        progress[PLACE] += 1
+    while progress[PLACE] < choices and signatures[progress[PLACE]] == zero:
+        progress[PLACE] += 1
+    return count
 
 
 @lean_kernel
@@ -166,11 +188,8 @@ def run_passes(
                         terms[2 * count + 1] = part
                         count += 1
                 if c == choices:
-                    for j in range(choices):
-                        if signatures[j] != zero:
-                            terms[2 * count] = factors[j]
-                            terms[2 * count + 1] = signatures[j]
-                            count += 1
+                    progress[PLACE] = 0
+                    count = next_terms(terms, signatures, factors, int64(0), zero, progress)
                 begin_sum(stack, sum_state, count, plain[NORMALISED])
                 progress[STEP] = 2
                 if count == 0:
@@ -189,6 +208,12 @@ def run_passes(
                 head[2] += STEPS - sum_state[2]
                 sum_state[2] = STEPS
                 signatures[c] = results[0]
+                if c == choices and progress[PLACE] < choices:
+                    terms[0] = plain[ONE]
+                    terms[1] = signatures[c]
+                    count = next_terms(terms, signatures, factors, int64(1), zero, progress)
+                    begin_sum(stack, sum_state, count, plain[NORMALISED])
+                    continue
                 progress[STEP] = 0
             progress[CHOICE] += 1
         code = run_split(

@@ -26,7 +26,7 @@ from factored_polca.diagrams.operations import Walk, operator_row
 from factored_polca.diagrams.operators import OPERATORS
 from factored_polca.diagrams.sums import sum_options
 from factored_polca.minimisation.criterion import Choice, ProcessView
-from factored_polca.minimisation.pass_kernel import BEYOND, PAUSE, run_passes
+from factored_polca.minimisation.pass_kernel import BEYOND, CHOICE, PAUSE, STEP, run_passes
 from factored_polca.minimisation.race import Race
 from factored_polca.minimisation.split_kernel import (
     BLOCKS,
@@ -107,6 +107,7 @@ class Propagation:
         self._list_choices()
         self._prepare_primitives()
         self._size_arrays(elements)
+        self.steps_allowed = self.stop_at = UNLIMITED // 2
         self.collections = -1
         self._refresh()
         self._measure(labels)
@@ -266,21 +267,29 @@ class Propagation:
     def run(self, passes: int = UNLIMITED) -> bool:
         """Up to so many passes, fewer where nothing changes any more; answer whether a block was split.
 
+        It stops before the next pass when the kernels have taken `steps_allowed` steps.
+
         Raises:
             TooManyBlocks: there are more than allowed.
             MemoryLimit, Aborted: `labels` is the partition so far.
             Vanished: a draw for observations can't be used.
         """
         before = self.blocks
+        self.stop_at = int(self.manager.head[2]) + self.steps_allowed
         end = self.passes + passes
         try:
-            while self.passes < end and self.live[DIFFERENCE] != self.zero.node:
+            while self.passes < end and self.unfinished and self.manager.head[2] < self.stop_at:
                 self._collect_if_due()
                 self._regress_others()
                 self._run_until(self.passes + 1 if self.others or self.regressed_handles else end)
         finally:
             self._hold()
         return self.blocks > before
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether something has changed that no pass has looked at."""
+        return bool(self.live[DIFFERENCE] != self.zero.node)
 
     def _collect_if_due(self) -> None:
         if self.manager.head[0] > self.manager.collect_at:
@@ -348,5 +357,7 @@ class Propagation:
                 self._collect_if_due()
                 if self.look is not None:
                     self.look(self.passes, self.blocks)
+                if self.progress[CHOICE] == self.progress[STEP] == 0 and m.head[2] >= self.stop_at:
+                    return
             else:
                 assert code == YIELDED

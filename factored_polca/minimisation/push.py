@@ -176,12 +176,14 @@ def _plain_plan(symbolic: SymbolicModel, diagram: Diagram) -> PushPlan:
     feature_at = np.full(manager.leaf_level + 1, -1, dtype=np.int32)
     for feature in range(len(symbolic.order)):
         feature_at[symbolic.now(feature)] = feature
+    drawn, slot = np.unique(feature_at[levels[inner]], return_inverse=True)
+    slots = np.full(len(nodes), -1, dtype=np.int32)
+    slots[inner] = slot.reshape(-1)
     leaf = np.full(len(nodes), -1, dtype=np.int64)
     leaf[~inner] = leaf_payloads(manager, nodes[~inner]).astype(np.int64)
     return PushPlan(
-        tuple(Slot(i) for i in range(len(symbolic.order))),
-        number[-1:].copy(),
-        feature_at[levels].astype(np.int32), _ranks(levels), first.astype(np.int64),
+        tuple(Slot(int(i)) for i in drawn),
+        number[-1:].copy(), slots, _ranks(levels), first.astype(np.int64),
         children.astype(np.int32), leaf,
     )  # fmt: skip
 
@@ -237,19 +239,20 @@ def rows_at(
     states: npt.NDArray[np.int32],
 ) -> Int32Array:
     """The row that each slot selects at each state: int32 [state, slot]; `states` is [state, feature]."""
-    count = len(symbolic.model.features)
-    result = np.empty((len(states), len(slots)), dtype=np.int32)
-    pairs = np.zeros((len(states), 2 * count), dtype=np.int32)
-    pairs[:, :count] = states
-    columns = symbolic.columns()
+    count, columns = len(symbolic.model.features), symbolic.columns()
+    features = np.array([slot.feature for slot in slots], dtype=np.int64)
+    offsets = np.array([table.offset[slot.feature] for slot in slots], dtype=np.int32)
+    result: Int32Array = np.take(states, features, axis=1) + offsets  # of those that persist
+    pairs = states
+    if any(slot.parents for slot in slots):
+        pairs = np.zeros((len(states), 2 * count), dtype=np.int32)
+        pairs[:, :count] = states
     for number, slot in enumerate(slots):
         if slot.feature in rows:
             for parent, value in slot.parents:
                 pairs[:, count + parent] = value
-            chosen = evaluate_states(rows[slot.feature].diagram, pairs, columns)
-        else:
-            chosen = states[:, slot.feature]
-        result[:, number] = table.offset[slot.feature] + chosen
+            found = evaluate_states(rows[slot.feature].diagram, pairs, columns)
+            result[:, number] = offsets[number] + found.astype(np.int32)
     return result
 
 
@@ -268,50 +271,65 @@ def push_floats(
     Answers 0 when done, 1 if the room ran out, 2 after `PAIRS` pairs, so that Ctrl-C is seen.
     `state` is [next row, pairs written].  Each level has a list of its places that mass has come to, so
     that a place has all its mass when it is taken; a level's list begins where its places do.
+
+    What a level sends on depends on the rows selected at that level and above.  So a state begins at the
+    first level where its rows are not those of the state before: what was sent from there on is taken back,
+    the last first, to what `log` says the mass of a place was.  Representatives in their order differ but
+    at a few levels below.
     """
     places = len(slot)
+    slots = chosen.shape[1]
     levels = level[places - 1] + 1
     begins = np.zeros(levels, np.int64)
     for j in range(places - 1):
         if level[j + 1] != level[j]:
             begins[level[j + 1]] = j + 1
     count = np.zeros(levels, np.int64)
-    waiting = np.empty(places, np.int32)
-    mass = np.zeros(places, np.float64)
+    level_of = np.full(slots, levels, np.int64)  # of slots
     largest = 0
     for q in range(places):
+        if slot[q] >= 0:
+            level_of[slot[q]] = level[q]
         if leaf[q] > largest:
             largest = leaf[q]
+    waiting = np.empty(places, np.int32)
+    mass = np.zeros(places, np.float64)
+    logged = np.empty(len(children), np.int32)
+    log = np.empty(len(children), np.float64)
+    log_begins = np.zeros(levels + 1, np.int64)
     total = np.zeros(largest + 1, np.float64)
     leaves = np.empty(largest + 2, np.int32)
+    for j in range(len(roots)):
+        q = roots[j]
+        if mass[q] == 0.0:
+            waiting[begins[level[q]] + count[level[q]]] = q
+            count[level[q]] += 1
+        mass[q] += 1.0
+    begun = False
     pause_at = state[1] + PAIRS
     while state[0] < len(chosen):
         if state[1] >= pause_at:
             return 2
         row = state[0]
-        ends = 0
-        smallest = largest
-        for j in range(len(roots)):
-            q = roots[j]
-            if mass[q] == 0.0:
-                waiting[begins[level[q]] + count[level[q]]] = q
-                count[level[q]] += 1
-            mass[q] += 1.0
-        for at in range(levels):
+        at = 0
+        if begun:
+            at = levels
+            for j in range(slots):
+                if chosen[row, j] != chosen[row - 1, j]:
+                    at = min(at, level_of[j])
+            for k in range(log_begins[levels] - 1, log_begins[at] - 1, -1):
+                q = logged[k]
+                mass[q] = log[k]
+                if log[k] == 0.0:
+                    count[level[q]] -= 1
+        written = log_begins[at]
+        while at < levels:
+            log_begins[at] = written
             for i in range(begins[at], begins[at] + count[at]):
                 q = waiting[i]
-                m = mass[q]
-                mass[q] = 0.0
-                if m == 0.0:
-                    continue
                 if slot[q] < 0:
-                    k = leaf[q]
-                    if total[k] == 0.0:
-                        leaves[ends] = k
-                        ends += 1
-                        smallest = min(smallest, k)
-                    total[k] += m
                     continue
+                m = mass[q]
                 r = chosen[row, slot[q]]
                 for e in range(start[r], start[r + 1]):
                     child = children[first_child[q] + value[e]]
@@ -321,8 +339,22 @@ def push_floats(
                     if mass[child] == 0.0:
                         waiting[begins[level[child]] + count[level[child]]] = child
                         count[level[child]] += 1
+                    logged[written] = child
+                    log[written] = mass[child]
+                    written += 1
                     mass[child] += part
-            count[at] = 0
+            at += 1
+        log_begins[levels] = written
+        begun = True
+        ends = 0
+        smallest = largest
+        for i in range(begins[levels - 1], begins[levels - 1] + count[levels - 1]):
+            k = leaf[waiting[i]]
+            if total[k] == 0.0:
+                leaves[ends] = k
+                ends += 1
+                smallest = min(smallest, k)
+            total[k] += mass[waiting[i]]
         if state[1] + ends > len(blocks):
             for j in range(ends):
                 total[leaves[j]] = 0.0

@@ -9,6 +9,9 @@ regression through choice c, masked.
     3. a confirming pass repeats the rewards of 0, and 1, with fresh draws and another, random, prime; a
        split there sends the refinement on with that prime.
 
+No confirming pass is needed where no two states are left that could differ: such a partition is stable
+with certainty (`factored_polca.minimisation.apart`), and the bound, as reported, too large.
+
 Many models are stable after a pass or two, and then step 2 would only do what step 3 does again.  So
 the first `EARLY` passes after the first one are confirming passes: one without a split is the last.
 
@@ -43,6 +46,7 @@ import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -62,14 +66,10 @@ from factored_polca.diagrams import (
 )
 from factored_polca.diagrams.operations import leaf_payloads, node
 from factored_polca.drawn import Drawn, Framed
-from factored_polca.minimisation.criterion import (
-    DecisionProcess,
-    ProcessView,
-    common_denominator,
-    largest_reward,
-    reward_denominator,
-    row_denominator,
-)
+from factored_polca.minimisation.apart import all_apart
+from factored_polca.minimisation.collision import collision_bound
+from factored_polca.minimisation.criterion import DecisionProcess, ProcessView, common_denominator
+from factored_polca.minimisation.listed import ListedPartition, ListedRefinement, StateList, state_list
 from factored_polca.minimisation.partition import Partition, partition_from
 from factored_polca.minimisation.polynomial import Polynomial, refuse_partial
 from factored_polca.minimisation.propagation import LARGE, UNLIMITED, Propagation, TooManyBlocks
@@ -78,10 +78,6 @@ from factored_polca.models import LimitReached
 from factored_polca.symbolic import NumericView
 from factored_polca.symbolic.descent import Cuts
 from factored_polca.symbolic.sensing import SensedRegression, Vanished
-
-PRIMES_IN_RANGE = 2.7e16
-"""A lower bound on the number of primes in [2^60, 2^61): 2^60 / ln(2^61) = 2.72e16 (Rosser &
-Schoenfeld 1962 give pi(2x) - pi(x) > 0.6 x / ln x; the density at 2^61 is 1 / 42.3)."""
 
 EARLY = 3
 """Passes after the first that are confirming passes whatever went before."""
@@ -157,7 +153,7 @@ def minimise(
             "minimisation",
             refinement.partition_so_far(),
         ) from None
-    bound = refinement.bound() ** confirmations * refinement.attempts
+    bound = collision_bound(process, interchangeable) ** confirmations * max(1, refinement.attempts)
     seconds = time.perf_counter() - start
     primes = tuple(refinement.primes)
     return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
@@ -187,7 +183,9 @@ class _Refinement:
         self.attempts = 0
         self.primes: list[int] = []
         self.labels = _Labels(self.manager.constant(0), np.zeros(1, dtype=np.uint64))
-        self.propagation: Propagation | None = None
+        self.propagation: Propagation | ListedRefinement | None = None
+        self.listed: StateList | None = None
+        self.as_list: ListedPartition | None = None
         self.race = Race()
         self.cuts: Cuts = {}
         self.denominator = common_denominator(process)
@@ -229,7 +227,7 @@ class _Refinement:
         self.begin()
         self.one_pass()
         passed = 0
-        while passed < confirmations:
+        while passed < confirmations and not self.is_certain():
             self.use(Field(self.fresh_prime()))
             before = self.labels.blocks
             self.split_rewards()  # the rest of the beginning knows no numbers
@@ -240,6 +238,10 @@ class _Refinement:
                     self.refine()
             else:
                 passed += 1
+
+    def is_certain(self) -> bool:
+        """Whether the partition is stable since no two states are left that could differ."""
+        return not self.interchangeable and all_apart(self.view, self.labels.diagram, self.labels.blocks)
 
     def fresh_prime(self) -> int:
         """A random prime not used yet that divides no denominator of the model."""
@@ -302,6 +304,13 @@ class _Refinement:
             while self.one_pass():
                 pass
             return
+        listed = state_list(self.view, self.labels.diagram)
+        if isinstance(self.propagation, Propagation) and listed is not None:
+            self.propagation.steps_allowed = listed.steps
+            self.propagate(UNLIMITED)
+            if not isinstance(self.propagation, Propagation) or not self.propagation.unfinished:
+                return
+            self.listed, self.propagation = listed, None
         self.propagate(UNLIMITED)
 
     def one_pass(self) -> bool:
@@ -341,19 +350,31 @@ class _Refinement:
             self.rounds += propagation.passes - done
             self.report(self.rounds, propagation.blocks)
 
-    def new_propagation(self) -> Propagation:
+    def new_propagation(self) -> Propagation | ListedRefinement:
         """The present partition as the start of passes in the present field."""
         outside = self.labels.blocks - self.blocks
+        allowed = None if self.block_limit is None else self.block_limit + outside
+        draw = partial(self.field.draw, self.generator)
+
+        def look(passes: int, blocks: int) -> None:
+            self.report(self.rounds + passes, blocks)
+
+        if self.listed is not None:
+            try:
+                return ListedRefinement(
+                    self.view, self.listed, self.labels.diagram, draw, allowed=allowed, look=look,
+                    known=self.as_list,
+                )  # fmt: skip
+            except MemoryError:
+                self.listed = None
         return Propagation(
-            self.view, self.labels.diagram, self.labels.elements,
-            lambda count: self.field.draw(self.generator, count),
-            allowed=None if self.block_limit is None else self.block_limit + outside,
-            look=lambda passes, blocks: self.report(self.rounds + passes, blocks), race=self.race,
-            cuts=self.cuts,
+            self.view, self.labels.diagram, self.labels.elements, draw, allowed=allowed, look=look,
+            race=self.race, cuts=self.cuts,
         )  # fmt: skip
 
-    def keep(self, propagation: Propagation) -> None:
+    def keep(self, propagation: Propagation | ListedRefinement) -> None:
         """The partition that it has come to."""
+        self.as_list = propagation.partition if isinstance(propagation, ListedRefinement) else None
         self.labels = _Labels(propagation.labels, propagation.elements[: propagation.blocks])
 
     def report(self, rounds: int, labels: int) -> None:
@@ -364,6 +385,9 @@ class _Refinement:
     def split(self, by: Diagram) -> None:
         """Replace the partition by the distinct pairs (block, leaf of `by`)."""
         if by.is_constant:
+            return
+        known = self.as_list
+        if known is not None and known.diagram == self.labels.diagram and not known.is_split_by(by):
             return
         numbered, old_leaf, _ = pairs(self.labels.diagram, by)
         old = leaf_payloads(self.manager, old_leaf).astype(np.int64)
@@ -414,33 +438,3 @@ class _Refinement:
             return None
         finally:
             self.manager.deadline = deadline
-
-    def bound(self) -> float:
-        """The probability that one confirming round lets a wrong partition pass."""
-        degree = 3 + len(self.process.channels or ())
-        open_numbers = self.process.open_numbers
-        if open_numbers is None:
-            bits = difference_bits(self.process)
-        else:
-            degree, bits = degree + open_numbers.degree, open_numbers.bits
-        if self.interchangeable:  # a product over the choices
-            degree, bits = degree * len(self.process.choices), bits * len(self.process.choices)
-        return bits / 60 / PRIMES_IN_RANGE + degree / 2**60
-
-
-def difference_bits(process: DecisionProcess) -> int:
-    """Bits of the largest cleared numerator of a difference of two entries of rows, or of two rewards.
-
-    An entry of a row of primitive p is n / D_p with 0 <= n <= D_p, a reward n / C_p with |n| <= N_p.  In
-    one block a choice may stand for different primitives p, q, so both denominators are cleared:
-    |n_x D_q - n_y D_p| <= D_p D_q, and |n_x C_q - n_y C_p| <= N_p C_q + N_q C_p.
-    """
-    bits = 1
-    for primitive in {p for choice in process.choices for p in choice.primitives}:
-        common = reward_denominator(process, primitive)
-        numerator = int(common * largest_reward(process, primitive))
-        bits = max(
-            bits, row_denominator(process, primitive).bit_length(), common.bit_length(),
-            numerator.bit_length(),
-        )  # fmt: skip
-    return 2 * bits + 1

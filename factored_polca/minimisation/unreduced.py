@@ -1,6 +1,6 @@
 """The flat model as arrays, read off its diagrams without minimising: every state apart.
 
-For each action a the successors of all states are listed at once, feature by feature (`outcomes`):
+For each action a the successors of all states are listed one by one (`expansion`):
 
     K_a(x; x', o) = prod_i P_a(x_i' | x, x') * prod_j P_a(o_j | x', x),
     R_a(x)        = sum of the compiled terms, expectations over x' and o taken.
@@ -30,6 +30,7 @@ from factored_polca.diagrams import evaluate_states
 from factored_polca.explicit.arrays import ArrayMDP, BoolArray, SparseMatrix
 from factored_polca.explicit.exact_pomdp import observation_label
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP, array_pomdp
+from factored_polca.minimisation.expansion import DoesNotApply, Expansion, Piece, TooMany
 from factored_polca.minimisation.outcomes import (
     Draw,
     FloatArray,
@@ -71,8 +72,8 @@ class _Entries:
     draws: list[Draw]
     sensed: list[int]  # the channels that are sensed, ascending
     seen: Numbering  # their joint values
-    source: list[Int64Array] = field(default_factory=list)
-    target: list[Int64Array] = field(default_factory=list)
+    source: list[Int32Array] = field(default_factory=list)
+    target: list[Int32Array] = field(default_factory=list)
     observation: list[Int64Array] = field(default_factory=list)
     chance: list[FloatArray] = field(default_factory=list)
 
@@ -97,7 +98,8 @@ class _Listing:
         self.model = symbolic.model
         self.features = len(self.model.features)
         self.columns = symbolic.columns()
-        self.states = Numbering([len(f.values) for f in self.model.features])
+        self.product = Numbering([len(f.values) for f in self.model.features])
+        self.expansion = Expansion(symbolic, (limits.states, limits.entries), reachable=reachable)
         self.entries = [self._prepare(action) for action in symbolic.actions]
         self.count = 0
 
@@ -111,15 +113,8 @@ class _Listing:
     def number(self, digits: Int32Array) -> Int64Array:
         """The number of each state [k, feature]."""
         if not self.reachable:  # every state has its number already
-            return self.states.encode(digits)[:, 0]
-        numbers = self.states.number(digits)
-        if len(self.states) > self.limits.states:
-            raise LimitReached(
-                f"{self.model.name}: more than {self.limits.states} states can be reached; raise "
-                "maximum_states, or minimise the model",
-                stage="listing the states",
-            )
-        return numbers
+            return self.product.encode(digits)[:, 0]
+        return self.expansion.add(digits)
 
     def initial(self) -> tuple[Int64Array, FloatArray]:
         """The states of the initial belief's support and their probabilities."""
@@ -134,52 +129,61 @@ class _Listing:
 
     def all_states(self) -> Int32Array:
         """All states of the product [s, feature]."""
-        if self.states.count > self.limits.states:
+        if self.product.count > self.limits.states:
             raise LimitReached(
-                f"{self.model.name}: {self.states.count} states are more than the {self.limits.states} "
+                f"{self.model.name}: {self.product.count} states are more than the {self.limits.states} "
                 "that may be listed; raise maximum_states, list the reachable ones, or minimise the model",
                 stage="listing the states",
             )
-        return self.states.decode(np.arange(self.states.count)[:, None])
+        return self.product.decode(np.arange(self.product.count)[:, None])
 
-    def expand(self, first: int, digits: Int32Array) -> None:
-        """Record the entries of the states numbered `first`, `first` + 1, ... [k, feature]."""
-        n, model = self.features, self.model
-        live = np.flatnonzero(~self.terminal(digits))
-        table = np.empty((len(live), 2 * n + len(model.observations)), dtype=np.int32)
-        table[:, :n] = table[:, n : 2 * n] = digits[live]
-        for j, channel in enumerate(model.observations):
-            table[:, 2 * n + j] = position(channel.values, channel.null) or 0
-        for entries in self.entries:
-            applies = self._applies(entries.action, table)
-            mine = table if applies.all() else table[applies]
-            numbers = first + (live if applies.all() else live[applies])
-            for source, rows, chance in outcomes(entries.draws, self.columns, mine):
-                entries.source.append(numbers[source])
-                entries.target.append(self.number(rows[:, n : 2 * n]))
-                entries.observation.append(self._observe(entries, rows))
-                entries.chance.append(chance)
-                self._count(len(chance))
+    def expand(self) -> None:
+        """Record the entries of all states, and of those that they lead to."""
+        channels = self.model.observations
+        nulls = [position(channel.values, channel.null) or 0 for channel in channels]
+        draws = [entries.draws for entries in self.entries]
+        try:
+            for piece in self.expansion.pieces(draws, nulls, total=self.total):
+                self._record(piece)
+                self._count(len(piece.chance))
+        except DoesNotApply as error:
+            raise self._partial(error) from None
+        except TooMany as error:
+            if error.what == "entries":
+                self._count(self.limits.entries + 1)
+            raise LimitReached(
+                f"{self.model.name}: more than {self.limits.states} states can be reached; raise "
+                "maximum_states, or minimise the model",
+                stage="listing the states",
+            ) from None
+
+    def _record(self, piece: Piece) -> None:
+        by_action = np.argsort(piece.action, kind="stable")
+        bounds = np.searchsorted(piece.action[by_action], np.arange(len(self.entries) + 1)).tolist()
+        for entries, low, high in zip(self.entries, bounds[:-1], bounds[1:], strict=True):
+            if low < high:
+                mine = by_action[low:high]
+                entries.source.append(piece.source[mine])
+                entries.target.append(piece.target[mine])
+                entries.chance.append(piece.chance[mine])
+                entries.observation.append(self._observe(entries, piece.seen[mine]))
 
     def terminal(self, digits: Int32Array) -> BoolArray:
         """Which states are terminal."""
         return evaluate_states(self.symbolic.terminal, digits, self.columns).astype(np.bool_)
 
-    def _applies(self, action: SymbolicAction, table: Int32Array) -> BoolArray:
-        result = evaluate_states(action.app, table, self.columns).astype(np.bool_)
-        if self.total and not result.all():
-            values = table[int(np.flatnonzero(~result)[0])]
-            by_level = [values[column] for column in self.columns[: 2 * self.features]]
-            fault = Fault(
-                f"{action.name!r} does not apply at {self.symbolic.state_text(by_level)}",
-                ("actions", action.name, "applicable"),
-                "in a POMDP actions apply everywhere: state what happens where it has no effect",
-            )
-            raise ModelError([fault])
-        return result
+    def _partial(self, error: DoesNotApply) -> ModelError:
+        name = self.symbolic.actions[error.action].name
+        by_level = [error.digits[column % self.features] for column in self.columns[: 2 * self.features]]
+        fault = Fault(
+            f"{name!r} does not apply at {self.symbolic.state_text(by_level)}",
+            ("actions", name, "applicable"),
+            "in a POMDP actions apply everywhere: state what happens where it has no effect",
+        )
+        return ModelError([fault])
 
-    def _observe(self, entries: _Entries, rows: Int32Array) -> Int64Array:
-        numbers = entries.seen.number(rows[:, [2 * self.features + j for j in entries.sensed]])
+    def _observe(self, entries: _Entries, seen: Int32Array) -> Int64Array:
+        numbers = entries.seen.number(seen[:, entries.sensed])
         if len(entries.seen) > self.limits.observations:
             channels = [self.model.observations[j] for j in entries.sensed]
             listed = ", ".join(f"{c.name} ({len(c.values)} values)" for c in channels)
@@ -305,15 +309,9 @@ def unreduced_mdp(
 def _list(listing: _Listing) -> tuple[Int64Array, FloatArray]:
     """List the states and entries; the support of the initial belief and its weights."""
     if not listing.reachable:
-        listing.expand(0, listing.all_states())
-        return listing.initial()
+        listing.all_states()  # not too many
     initial = listing.initial()
-    done = 0
-    while done < len(listing.states):
-        listing.symbolic.manager.pause()  # a deadline of the model's counts here too
-        found = listing.states.tuples(done)
-        listing.expand(done, found)
-        done += len(found)
+    listing.expand()
     return initial
 
 
@@ -322,10 +320,10 @@ def _ordered(listing: _Listing) -> tuple[Int32Array, Int64Array]:
     if not listing.reachable:
         states = listing.all_states()
         return states, np.arange(len(states))
-    place = listing.states.ranks()
-    states = np.empty((len(place), listing.features), dtype=np.int32)
-    states[place] = listing.states.tuples()
-    return states, place
+    order = np.lexsort(listing.expansion.states.T[::-1])
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    return listing.expansion.states[order], place
 
 
 def _matrices(
@@ -358,7 +356,7 @@ def _matrices(
     return labels, matrices
 
 
-def _joined(pieces: Sequence[Int64Array]) -> Int64Array:
+def _joined(pieces: Sequence[Int32Array] | Sequence[Int64Array]) -> Int64Array:
     return np.concatenate([*pieces, np.empty(0, dtype=np.int64)])
 
 

@@ -7,13 +7,13 @@ beforehand which of the two is quicker.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams import Diagram, Field, LeafType, MemoryLimit, support
+from factored_polca.diagrams import Diagram, Field, LeafType, Manager, MemoryLimit, support
 from factored_polca.diagrams.forward import (
     BUDGET,
     ENTRIES,
@@ -215,25 +215,34 @@ class ForwardRegression:
 
     def join(self, payloads: npt.NDArray[np.uint64], leaf_type: LeafType) -> Diagram:
         """The diagram of all items, given what the leaf of each of the last level's is to hold."""
-        manager = self.manager
-        below = manager.leaf_nodes(payloads)
-        for level, child_items in zip(reversed(self.levels), reversed(self.child_items), strict=True):
-            items = len(child_items) // manager.sizes[level]
-            made = np.zeros(items, dtype=np.int32)
-            progress = np.zeros(1, dtype=np.int64)
-            above = below
+        leaves = self.manager.leaf_nodes(payloads)
+        return join_items(self.manager, self.levels, self.child_items, leaves, leaf_type)
 
-            def step(
-                level: int = level, child_items: Int32Array = child_items, items: int = items,
-                above: Int32Array = above, made: Int32Array = made, progress: Int64Array = progress,
-            ) -> int:  # fmt: skip
-                m = manager
-                done: int = join_level(
-                    m.pool, m.head, m.unique, m.arity, level, child_items, items, above, made, m.words,
-                    progress,
-                )  # fmt: skip
-                return done
 
-            manager.run(step)
-            below = made
-        return manager.handle(int(below[0]), leaf_type)
+def join_items(
+    manager: Manager, levels: Sequence[int], child_items: Sequence[Int32Array], below: Int32Array,
+    leaf_type: LeafType,
+) -> Diagram:  # fmt: skip
+    """The diagram of items, level by level.
+
+    `child_items` [level][size * item + value] are numbers of the next level's items, or, at the last level,
+    of the nodes `below`.
+    """
+    for level, children in zip(reversed(levels), reversed(child_items), strict=True):
+        items = len(children) // manager.sizes[level]
+        made = np.zeros(items, dtype=np.int32)
+        progress = np.zeros(1, dtype=np.int64)
+
+        def step(
+            level: int = level, children: Int32Array = children, items: int = items,
+            above: Int32Array = below, made: Int32Array = made, progress: Int64Array = progress,
+        ) -> int:  # fmt: skip
+            m = manager
+            done: int = join_level(
+                m.pool, m.head, m.unique, m.arity, level, children, items, above, made, m.words, progress
+            )
+            return done
+
+        manager.run(step)
+        below = made
+    return manager.handle(int(below[0]), leaf_type)
