@@ -154,6 +154,7 @@ def test_lists_are_turned_to_where_diagrams_take_long(monkeypatch: pytest.Monkey
     ((before, after),) = runs  # no confirming pass: each value of x is a block
     assert before < 650
     assert after == 700
+    assert found.states_listed == 700  # of the values of x; the other feature matters to nothing
 
 
 def test_both_ways_give_one_diagram(request: pytest.FixtureRequest) -> None:
@@ -162,6 +163,7 @@ def test_both_ways_give_one_diagram(request: pytest.FixtureRequest) -> None:
     used: list[StateList] = request.getfixturevalue("used")
     by_lists = minimise(process, seed=1)
     assert [what.states for what in used] == [6 * 6 * 6 * 4]
+    assert (by_diagrams.states_listed, by_lists.states_listed) == (0, 6 * 6 * 6 * 4)
     assert by_lists.partition.diagram == by_diagrams.partition.diagram
     assert by_lists.partition.blocks == 6 * 6 * 5 * 4 + 1  # no two live states are alike
 

@@ -88,7 +88,8 @@ class Minimisation(Drawn, Framed):
     """A partition and how it was found.
 
     `rounds` counts passes over the choices, confirming ones included; `collision_bound` bounds the
-    probability that the partition is coarser than the coarsest stable one.
+    probability that the partition is coarser than the coarsest stable one.  `states_listed` is 0, or how
+    many states there were on the list where that was quicker than diagrams.
     """
 
     process: DecisionProcess
@@ -97,6 +98,7 @@ class Minimisation(Drawn, Framed):
     primes: tuple[int, ...]
     collision_bound: float
     seconds: float
+    states_listed: int = 0
 
 
 Progress = Callable[[int, int], None]
@@ -156,7 +158,8 @@ def minimise(
     bound = collision_bound(process, interchangeable) ** confirmations * max(1, refinement.attempts)
     seconds = time.perf_counter() - start
     primes = tuple(refinement.primes)
-    return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds)
+    listed = 0 if refinement.listed is None else refinement.listed.states
+    return Minimisation(process, refinement.partition(), refinement.rounds, primes, bound, seconds, listed)
 
 
 class _Refinement:
