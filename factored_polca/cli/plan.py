@@ -270,9 +270,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     )  # fmt: skip
     output.table(table)
     output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
-    for row in data["tasks"]:
-        if row["blocks"] is None:
-            output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
+    print_without_blocks(data, output)
     said = within(data["value"], data["value_bounds"])
     output.line(f"value of the hierarchical policy from the start: [bold]{said}[/]")
     if data["flat_value"] is None:
@@ -290,6 +288,13 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
         classes, blocks = f"{stored['classes']:,}", f"{stored['blocks']:,}"
         output.line(f"stored by {stored['by']}: {classes} classes in place of {blocks} blocks")
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def print_without_blocks(data: dict[str, Any], output: Output) -> None:
+    """How tasks without a quotient were solved."""
+    for row in data["tasks"]:
+        if row["blocks"] is None:
+            output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
 
 
 def within(value: float, bounds: Sequence[float]) -> str:
@@ -314,17 +319,17 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
-        counts, measured = row["observations"].values(), data["measured"].get(row["name"])
+        measured = data["measured"].get(row["name"])
         table.add_row(
-            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}",
-            f"{sum(c['before'] for c in counts):,} -> {sum(c['after'] for c in counts):,}",
+            escape(row["name"]), f"{len(row['actions'])}", counted(row["blocks"]),
+            observations_text(row["observations"]),
             *parameters_text(row["parameters"]), f"{brief(row['lower'])} .. {brief(row['upper'])}",
             f"{row['corner_gap']:.2g}", "" if measured is None else measured_text(measured),
             seconds(row["seconds"]),
         )  # fmt: skip
     table.add_section()
     table.add_row(
-        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", "",
+        "all", "", f"{sum(row['blocks'] or 0 for row in data['tasks']):,}", "",
         *parameters_text(data["totals"]["parameters"]), "", "", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
@@ -333,6 +338,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         "parameters of the task's model (Figure 4a); as planned: bounds in the task's own model, where a "
         "child does what it does when certain of the state"
     )
+    print_without_blocks(data, output)
     output.line(
         f"the hierarchical policy earns [bold]{data['value']:.6g}[/] ± {data['standard_error']:.2g} from "
         f"the start (mean and standard error, {data['episodes']:,} episodes of {data['steps']:,} steps)"
@@ -344,6 +350,14 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
     output.line(f"tracker: {escape(data['tracker'])}; {escape(data['tracker_reason'])}")
     print_merging(data, output)
     output.line(f"guarantee: {escape(data['guarantee'])}")
+
+
+def observations_text(counts: dict[str, dict[str, int]] | None) -> str:
+    """Joint observations before and after merging; a dash where there is no quotient."""
+    if counts is None:
+        return "-"
+    before, after = (sum(count[key] for count in counts.values()) for key in ("before", "after"))
+    return f"{before:,} -> {after:,}"
 
 
 def brief(value: float) -> str:

@@ -329,7 +329,7 @@ class BeliefSpace:
     ) -> list[tuple[float, PointBelief]]:
         """The initial belief: the probability of each value of what is seen, and the belief there.
 
-        Mass at terminal states is left out.  `rows`, over the next variables, take the place of the model's.
+        Mass at terminal states is left out.  `rows`, over next variables, take the place of the model's.
 
         Raises:
             LimitReached: the initial belief is too large, or has too many values of what is seen.

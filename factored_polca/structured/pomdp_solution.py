@@ -91,7 +91,7 @@ class AlphaDiagrams:
         if seen not in self._sets:
             pomdp = self.space.pomdp
             blind = [Alpha(seen, a, pomdp.at(seen, d), blind=True) for a, d in self.blind]
-            self._sets[seen] = AlphaSet(pomdp, [*self.slices.get(seen, ()), *blind])
+            self._sets[seen] = AlphaSet(pomdp, [*blind, *self.slices.get(seen, ())])
         return self._sets[seen]
 
     def choose(self, belief: PointBelief) -> int:
@@ -211,7 +211,7 @@ class _Run:
         )
 
     def improve_everywhere(self) -> Status:
-        """Trials from the worst of the corners, the uniform belief and the start, until all gaps are closed.
+        """Trials from the worst of the corners, the uniform belief and the start, until gaps are closed.
 
         A belief from which a trial changed nothing is given up.
         """
@@ -322,8 +322,8 @@ def solve_symbolic(
 ) -> SymbolicSolution:
     """Bounds on the optimal value of a partially observed model, and a policy, without listing its states.
 
-    `demand.iterations` counts trials.  `everywhere` asks for the gap at all corners and at the uniform belief
-    as well, and not only at the initial one.
+    `demand.iterations` counts trials.  `everywhere` asks for the gap at all corners and at the uniform
+    belief as well, and not only at the initial one.
 
     Raises:
         ModelError: a fully observed model, a finite horizon, or a discount of 1.

@@ -1,7 +1,7 @@
 """A partially observed decision process, one subtask of a model say, as a model of its own.
 
-The solver on diagrams (`pomdp_solution`) reads a `SymbolicModel`.  That of a process has one action for each
-choice, the process's terminal set, its rewards, and of the channels only those that count.  A choice c that
+The solver on diagrams (`pomdp_solution`) reads a `SymbolicModel`.  That of a process has one action for
+each choice, the process's terminal set, its rewards, and of the channels only those that count.  A choice c that
 stands for primitives, by the policy pi_c of a child, has for each feature the rows of pi_c(x),
 
     P_c(x_i' | x, x') = P_{pi_c(x)}(x_i' | x, x'),
@@ -68,7 +68,7 @@ def _action(process: DecisionProcess, choice: Choice) -> SymbolicAction:
 
 
 def _selected(number: int, parts: Sequence[tuple[Diagram, RowDiagram]]) -> RowDiagram:
-    """The row diagram that is one of several, by conditions of which one holds at each state that counts."""
+    """The row diagram that is one of several, by conditions of which one holds wherever it counts."""
     numbers: dict[Row, int] = {}
     parents: set[int] = set()
     result: Diagram | None = None
