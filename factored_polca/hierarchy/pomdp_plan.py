@@ -52,8 +52,10 @@ from factored_polca.hierarchy.subtask import planning_channels, refuse_without_p
 from factored_polca.hierarchy.symbolic_task import (
     SYMBOLIC,
     AnySolvedPomdpTask,
+    SymbolicPomdpTask,
     limits_of,
     solve_on_diagrams,
+    upper_on_diagrams,
 )
 from factored_polca.minimisation import DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.models import Fault, LimitReached, Model, ModelError, Task, TaskHierarchy, flat_task
@@ -356,6 +358,8 @@ class _Planner:
             return FlatBound(None, None, "the root has a reward of its own")
         self.tell("flat bound", "parameterise")
         process = flat_process(self.symbolic, reachable=self.reachable, terminal=root.process.terminal)
+        if any(isinstance(solved, SymbolicPomdpTask) for solved in self.solved.values()):
+            return self.flat_on_diagrams(process, root)
         try:
             with limits_of("flat bound"):
                 reduction = self.reduce("flat bound", process, limit)
@@ -367,6 +371,17 @@ class _Planner:
         if found.status == "interrupted":
             raise KeyboardInterrupt
         return FlatBound(found.upper, pomdp.states, "fast informed bound on the flat quotient")
+
+    def flat_on_diagrams(self, process: DecisionProcess, root: AnySolvedPomdpTask) -> FlatBound:
+        """The same without a quotient."""
+        primitives = tuple(action.name for action in self.symbolic.actions)
+        if root.task.actions == primitives:
+            return FlatBound(root.upper, None, "the plan is flat")
+        try:
+            upper = upper_on_diagrams(process, self.options)
+        except LimitReached as error:
+            return FlatBound(None, None, f"left out: {error}")
+        return FlatBound(upper, None, "fast informed bound on diagrams, without a quotient")
 
 
 def refuse_memory(solution: POMDPSolution, name: str) -> None:

@@ -109,9 +109,7 @@ def solve_on_diagrams(
         seed=options.seed,
         progress=progress,
     )
-    if options.deadline is not None:
-        now = time.monotonic()
-        demand = replace(demand, deadline=now + max(0.0, options.deadline - now) / shares)
+    demand = _within(demand, options, shares)
     with limits_of(task.name):
         solution = solve_symbolic(process_model(process), demand, everywhere=not is_root)
         if solution.status == "interrupted":
@@ -132,6 +130,30 @@ def solve_on_diagrams(
         task, process, solution, corner, policy, process.symbolic.manager.constant(1), reason,
         time.perf_counter() - began, tuple(warnings),
     )  # fmt: skip
+
+
+def upper_on_diagrams(process: DecisionProcess, options: Options) -> float:
+    """What no policy can earn more of from the initial belief on: the first upper bound on diagrams.
+
+    It takes half of the time that is left, at most.
+
+    Raises:
+        LimitReached: too many joint observations or values of what is seen.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    demand = Demand(gap=max(RELATIVE_GAP * reward_span(process), 1e-12), iterations=0)
+    found = solve_symbolic(process_model(process), _within(demand, options, 2))
+    if found.status == "interrupted":
+        raise KeyboardInterrupt
+    return found.upper
+
+
+def _within(demand: Demand, options: Options, shares: int) -> Demand:
+    """The demand with one of so many parts of the time that is left."""
+    if options.deadline is None:
+        return demand
+    now = time.monotonic()
+    return replace(demand, deadline=now + max(0.0, options.deadline - now) / shares)
 
 
 @contextmanager

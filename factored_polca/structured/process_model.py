@@ -1,8 +1,8 @@
 """A partially observed decision process, one subtask of a model say, as a model of its own.
 
 The solver on diagrams (`pomdp_solution`) reads a `SymbolicModel`.  That of a process has one action for
-each choice, the process's terminal set, its rewards, and of the channels only those that count.  A choice c that
-stands for primitives, by the policy pi_c of a child, has for each feature the rows of pi_c(x),
+each choice, the process's terminal set, its rewards, and of the channels only those that count.  A choice c
+that stands for primitives, by the policy pi_c of a child, has for each feature the rows of pi_c(x),
 
     P_c(x_i' | x, x') = P_{pi_c(x)}(x_i' | x, x'),
 

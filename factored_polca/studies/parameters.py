@@ -38,7 +38,7 @@ class TaskParameters:
     name: str
     none: int | None
     polca: int | None
-    polca_plus: int
+    polca_plus: int | None
 
 
 @dataclass(frozen=True)
