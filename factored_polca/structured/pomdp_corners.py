@@ -73,6 +73,9 @@ class Corners:
     def __init__(self, search: Search) -> None:
         self.search, self.pomdp = search, search.space.pomdp
         self.upper = largest_of(search.upper.quality)
+        for seen in search.upper.informed.q if search.upper.informed is not None else ():
+            better = apply("minimum", self.upper, largest_of(search.upper.base(seen)))
+            self.upper = choose(where_seen(self.pomdp, seen), better, self.upper)
         self.lower = largest_of([diagram for _, diagram in search.lower.blind])
         self.open = choose(self.pomdp.symbolic.terminal, self.pomdp.zero, self.pomdp.one)
         self._known: dict[Seen, tuple[int, int]] = {}

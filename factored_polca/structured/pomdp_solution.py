@@ -25,6 +25,7 @@ from factored_polca.structured.pomdp_belief import BELIEF_ERROR, BeliefSpace
 from factored_polca.structured.pomdp_bounds import FirstBounds, Sizes
 from factored_polca.structured.pomdp_cell_bounds import first_bounds
 from factored_polca.structured.pomdp_corners import Corners
+from factored_polca.structured.pomdp_informed import informed_bound
 from factored_polca.structured.pomdp_lower import Alpha, AlphaSet, LowerBound, closure
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen
 from factored_polca.structured.pomdp_point import PointBelief
@@ -49,6 +50,7 @@ BELIEF_LIMIT: Final = 1_000_000
 
 BLIND_SECONDS: Final = 20.0
 QMDP_SECONDS: Final = 60.0
+INFORMED_SECONDS: Final = 120.0
 """How long the first bounds may take, where that is less than their share of the time given."""
 
 UNIFORM: Final = 100
@@ -176,7 +178,7 @@ class _Run:
             self.demand.progress(*self.bounds)
 
     def first_bounds(self) -> None:
-        """Blind policies and QMDP."""
+        """Blind policies, QMDP and the fast informed bound."""
         left = self.demand.seconds_left
         starts = self.space.starts()
 
@@ -192,7 +194,10 @@ class _Run:
         )
         if tables:
             self.notes.append("the first bounds were found on tables of all states")
-        upper = UpperBound(self.space, quality, self.first.size)
+        left = self.demand.seconds_left
+        seen = [belief.seen for _, belief in starts]
+        informed = informed_bound(self.first, seen, quality, min(INFORMED_SECONDS, left / 4))
+        upper = UpperBound(self.space, quality, self.first.size, informed, self.sizes.width)
         search = Search(
             self.space, self._lower(), upper, poll=self.demand.poll, belief_limit=self.belief_limit
         )
