@@ -7,12 +7,13 @@ With Q_a at first those of QMDP, and y, x, W_o as in `pomdp_model`,
 
 QMDP lets the next action depend on the next state; here it may depend on what is observed only.  Each
 iterate bounds Q*_a at the corners: the value of beginning with a is convex, so that it is at most the mean
-of its values at the corners, and Q_a . b bounds it at any belief b.  So one may stop at any time, and a pointwise
-minimum of two bounds is one.  Where nothing ends and each Q_a fell by d at least, each falls by
+of its values at the corners, and Q_a . b bounds it at any belief b.  So one may stop at any time, and a
+pointwise minimum of two bounds is one.  Where nothing ends and each Q_a fell by d at least, each falls by
 discount * d / (1 - discount) more (MacQueen 1966).  What rounding may be off by is added at each backup.
 
-Actions with equal distributions of most features sum these out together.  A table has a cell for each value of the hidden features, and one is kept for each action and each y that
-the start can reach.  Actions whose Q_a is nowhere above that of another one are left out of the maximum.
+Actions with equal distributions of most features sum these out together.  A table has a cell for each value
+of the hidden features, and one is kept for each action and each y that the start can reach.  Actions whose
+Q_a is nowhere above that of another one are left out of the maximum.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ class InformedBound:
                 for number, weight in enumerate(member.outcomes):
                     after = eliminate(weight * function, member.late, group.synchronic)
                     largest = after.over((BATCH, *self.axes)).max(axis=0)
-                    np.maximum(found[number], largest, out=found[number])
+                    found[number] = np.maximum(found[number], largest)
         for member, found in zip(group.members, best, strict=True):
             yield member, found.sum(axis=0)
 
