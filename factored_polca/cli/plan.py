@@ -329,7 +329,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         )  # fmt: skip
     table.add_section()
     table.add_row(
-        "all", "", f"{sum(row['blocks'] or 0 for row in data['tasks']):,}", "",
+        "all", "", counted(sum(row["blocks"] or 0 for row in data["tasks"]) or None), "",
         *parameters_text(data["totals"]["parameters"]), "", "", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
