@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 from factored_polca.diagrams import Diagram, MemoryLimit, choose, leaves
-from factored_polca.drawn import DrawnGraph
+from factored_polca.drawn import Drawn
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_solved import RELATIVE_GAP, SolvedPomdpTask
 from factored_polca.hierarchy.structured_task import ASKED_FOR, refuse_without_purpose_on_diagrams
@@ -35,7 +35,7 @@ SYMBOLIC: Final = "symbolic"
 
 
 @dataclass(frozen=True)
-class SymbolicPomdpTask(DrawnGraph):
+class SymbolicPomdpTask(Drawn):
     """A subtask solved on diagrams, without a quotient; `reason` says why.
 
     For its parents it is what a `SolvedPomdpTask` is.  `corner` maps states to the number of the one of the

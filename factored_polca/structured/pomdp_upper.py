@@ -31,6 +31,9 @@ BoolArray = npt.NDArray[np.bool_]
 BASE_NODES = 2_000
 """Nodes of a base bound at one y."""
 
+INFORMED_NODES = 5_000
+"""The same of one that was found on tables, which has as many values as cells."""
+
 SHRUNK = 1 - 1e-12
 """What a computed ratio is multiplied by, to be below the exact one."""
 
@@ -201,7 +204,7 @@ class UpperBound:
     def base(self, seen: Seen) -> list[Diagram]:
         """Q_a [action] at one y."""
         if self.informed is not None and seen in self.informed.q:
-            return self.informed.diagrams(seen, BASE_NODES, self.width)
+            return self.informed.diagrams(seen, INFORMED_NODES, self.width)
         slices = [self.space.pomdp.at(seen, diagram) for diagram in self.quality]
         return [self._small(diagram) for diagram in slices]
 
