@@ -154,4 +154,6 @@ def read_alphas(archive: Archive, symbolic: SymbolicModel, count: int) -> AlphaD
             slices.setdefault(y, []).append(Alpha(y, action, diagram))
         else:
             raise ValueError("an alpha-vector is of values that are not to be seen")
+    if not blind:
+        raise ValueError("no alpha-vector is of the whole state")
     return AlphaDiagrams(symbolic, tuple(blind), {y: tuple(a) for y, a in slices.items()})
