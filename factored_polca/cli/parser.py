@@ -148,7 +148,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--solver", default="auto", type=solver, metavar="NAME",
         help="for tasks that name none: vi, pi, mpi, structured where the state is seen, else any that "
-        "solve has; or package.module:Name, which is imported",
+        "solve has, symbolic (without a quotient) among them; or package.module:Name, which is imported",
     )  # fmt: skip
     sub.add_argument("--no-flat", action="store_true", help="leave out the flat optimum")
     sub.add_argument(

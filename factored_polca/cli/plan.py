@@ -285,9 +285,7 @@ def print_plan(data: dict[str, Any], output: Output) -> None:
     output.table(table)
     print_status(data, output)
     output.line("Q-values: blocks x actions; classes: distinct ones, per action; shared: per task")
-    for row in data["tasks"]:
-        if row["blocks"] is None:
-            output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
+    print_without_blocks(data, output)
     said = within(data["value"], data["value_bounds"])
     output.line(f"value of the hierarchical policy from the start: [bold]{said}[/]")
     if data["flat_value"] is None:
@@ -325,6 +323,13 @@ def print_status(data: dict[str, Any], output: Output) -> None:
         output.line(f"[bold]{data['status']}[/]: the best plan so far; bounds hold, and may be wide")
 
 
+def print_without_blocks(data: dict[str, Any], output: Output) -> None:
+    """How tasks without a quotient were solved."""
+    for row in data["tasks"]:
+        if row["blocks"] is None:
+            output.line(f"{escape(row['name'])}: {escape(row['solver'])}, {escape(row['note'])}")
+
+
 def within(value: float, bounds: Sequence[float]) -> str:
     """A value, or its bounds where they are wide."""
     low, high = bounds
@@ -347,17 +352,17 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
     }  # fmt: skip
     table = make_table(f"{data['model']}: {big(data['states'])} states", columns)
     for row in data["tasks"]:
-        counts, measured = row["observations"].values(), data["measured"].get(row["name"])
+        measured = data["measured"].get(row["name"])
         table.add_row(
-            escape(row["name"]), f"{len(row['actions'])}", f"{row['blocks']:,}",
-            f"{sum(c['before'] for c in counts):,} -> {sum(c['after'] for c in counts):,}",
+            escape(row["name"]), f"{len(row['actions'])}", counted(row["blocks"]),
+            observations_text(row["observations"]),
             *parameters_text(row["parameters"]), f"{brief(row['lower'])} .. {brief(row['upper'])}",
             f"{row['corner_gap']:.2g}", "" if measured is None else measured_text(measured),
             seconds(row["seconds"]), *([row["status"]] if cut_column(data) else []),
         )  # fmt: skip
     table.add_section()
     table.add_row(
-        "all", "", f"{sum(row['blocks'] for row in data['tasks']):,}", "",
+        "all", "", counted(sum(row["blocks"] or 0 for row in data["tasks"]) or None), "",
         *parameters_text(data["totals"]["parameters"]), "", "", "", seconds(data["seconds"]),
     )  # fmt: skip
     output.table(table)
@@ -367,6 +372,7 @@ def print_pomdp_plan(data: dict[str, Any], output: Output) -> None:
         "parameters of the task's model (Figure 4a); as planned: bounds in the task's own model, where a "
         "child does what it does when certain of the state"
     )
+    print_without_blocks(data, output)
     if data["value"] is None:
         output.line("what the hierarchical policy earns was not measured: time was up")
     else:
@@ -392,6 +398,14 @@ def print_certified(certified: dict[str, Any], output: Output) -> None:
         output.line(f"certified: {note}")
     else:
         output.line(f"certified: the hierarchical policy earns {brief(low)} .. {brief(high)} ({note})")
+
+
+def observations_text(counts: dict[str, dict[str, int]] | None) -> str:
+    """Joint observations before and after merging; a dash where there is no quotient."""
+    if counts is None:
+        return "-"
+    before, after = (sum(count[key] for count in counts.values()) for key in ("before", "after"))
+    return f"{before:,} -> {after:,}"
 
 
 def brief(value: float) -> str:

@@ -11,7 +11,7 @@ from factored_polca.cli.output import Output
 def simulate_alpha_policy(arguments: argparse.Namespace, output: Output) -> dict[str, Any]:
     """A policy that `solve` found on diagrams, asked at beliefs that are diagrams, or else particles."""
     from factored_polca.cli.simulate import figures
-    from factored_polca.control.diagram_tracker import DiagramBelief
+    from factored_polca.control.diagram_polling import point_of
     from factored_polca.control.tracker import Belief, choose_tracker
     from factored_polca.hierarchy.alpha_policy_file import load_alpha_policy
     from factored_polca.simulation.belief_episodes import EPISODES, run_one_by_one
@@ -23,9 +23,7 @@ def simulate_alpha_policy(arguments: argparse.Namespace, output: Output) -> dict
         chosen = choose_tracker(policy.symbolic, block_limit=0, on_impossible="reset", seed=arguments.seed)
 
         def decide(belief: Belief) -> int:
-            if isinstance(belief, DiagramBelief):
-                return policy.choose(policy.space.of_factors(belief.factors))
-            return policy.choose(policy.space.of_marginals(belief.marginals()))
+            return policy.choose(point_of(policy, belief))
 
         found = run_one_by_one(
             chosen.tracker, decide, episodes=episodes, steps=arguments.steps, seed=arguments.seed,

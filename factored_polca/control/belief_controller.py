@@ -2,7 +2,8 @@
 
 One belief serves all tasks.  At each step it is projected onto the root's blocks and the root's policy
 asked; the child that it answers is asked at the same belief over *its* blocks, and so on until a primitive
-action comes back.  There is no stack.
+action comes back.  There is no stack.  A task that was solved on diagrams is asked at the whole belief
+(`diagram_polling`).
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factored_polca.control.diagram_polling import ask_on_diagrams
 from factored_polca.control.polling import ask
 from factored_polca.control.tracker import (
+    BLOCK_LIMIT,
     Belief,
     ChosenTracker,
     OnImpossible,
@@ -54,7 +57,9 @@ class BeliefDecision:
 
 def tracked_features(plan: ExecutablePomdpPlan) -> list[str]:
     """The features that some task tells apart, or that are seen: those whose marginals are of use."""
-    return tested_features(plan.symbolic, [partition.diagram for partition in plan.partitions])
+    told = [partition.diagram for partition in plan.partitions]
+    told += [diagram for task in plan.policies.values() for diagram in task.diagrams]
+    return tested_features(plan.symbolic, told)
 
 
 def block_state(partition: Partition, block: int) -> dict[str, Value]:
@@ -77,14 +82,17 @@ def plan_tracker(
 ) -> ChosenTracker:
     """The tracker that fits a plan: on the common refinement of its tasks, else others.
 
+    A task that was solved on diagrams is asked at the whole belief, which is then no vector over blocks.
     Blocks and diagrams are given up at `deadline`, a reading of `time.monotonic()`.
     """
+    on_diagrams = any(task.on_diagrams for task in plan.policies.values())
     return choose_tracker(
         plan.symbolic,
         plan.partitions,
         conditions=plan.conditions,
         features=tracked_features(plan),
         on_impossible=on_impossible,
+        block_limit=0 if on_diagrams else BLOCK_LIMIT,
         seed=seed,
         deadline=deadline,
     )
@@ -113,7 +121,11 @@ class BeliefController:
                 action in plan.policies and belief.support_in(plan.policies[action].ended)
                 for action in task.actions
             ]
-            chosen, ahead = ask(plan, name, over_blocks[None, :], np.array([sure]))
+            if task.on_diagrams:
+                number, looked_ahead = ask_on_diagrams(plan, name, belief, np.array(sure))
+            else:
+                chosen, ahead = ask(plan, name, over_blocks[None, :], np.array([sure]))
+                number, looked_ahead = int(chosen[0]), bool(ahead[0])
             block = int(over_blocks.argmax())
             path.append(
                 BeliefPoll(
@@ -121,9 +133,9 @@ class BeliefController:
                     block=block,
                     block_states=task.partition.sizes[block],
                     probability=float(over_blocks[block]),
-                    action=task.actions[int(chosen[0])],
+                    action=task.actions[number],
                     ended=bool(over_blocks[~task.terminal].sum() == 0),
-                    looked_ahead=bool(ahead[0]),
+                    looked_ahead=looked_ahead,
                 )
             )
             name = path[-1].action

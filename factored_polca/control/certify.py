@@ -74,9 +74,13 @@ def polled_bounds(
     """Bounds on what polling a plan earns, and over how many blocks they were found.
 
     Raises:
-        LimitReached, MemoryLimit, Aborted: too many blocks or observations, memory or time.
+        LimitReached, MemoryLimit, Aborted: too many blocks or observations, memory or time; or a task was
+            solved on diagrams, and has no policy over blocks.
         ModelError: discount 1.
     """
+    names = [task.name for task in plan.policies.values() if task.on_diagrams]
+    if names:
+        raise LimitReached(f"solved on diagrams, with no policy over blocks: {', '.join(names)}", "certify")
     symbolic = plan.symbolic
     process = flat_process(symbolic)
     separate = kept_apart(symbolic, plan.partitions, plan.conditions)
@@ -103,7 +107,7 @@ def own_policy(found: PomdpPlan) -> bool:
 
 def ends_with_the_model(found: PomdpPlan) -> bool:
     """Whether the root ends where the model does, and nowhere else."""
-    return found.root.reduction.process.terminal == found.symbolic.terminal
+    return found.root.process.terminal == found.symbolic.terminal
 
 
 def upper_bound(found: PomdpPlan) -> float | None:

@@ -26,7 +26,7 @@ def ask(
         beliefs: [n, block] over the task's blocks.
         ended: [n, action] whether the belief is sure that the action, a child, has ended.
     """
-    chosen = plan.policies[name].policy.choose(beliefs)
+    chosen = plan.policies[name].over_blocks.choose(beliefs)
     lost = ended[np.arange(len(chosen)), chosen] & ~ended.all(axis=1)
     for n in np.flatnonzero(lost).tolist():
         q_values = look_ahead(plan, name, beliefs[n])

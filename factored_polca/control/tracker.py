@@ -39,6 +39,7 @@ from factored_polca.minimisation import Partition
 from factored_polca.models import LimitReached, ModelError, Value
 from factored_polca.models.model import rational
 from factored_polca.symbolic import RowDiagram, SymbolicModel
+from factored_polca.symbolic.reach import uniform_rows
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -294,13 +295,6 @@ def independent_belief(
             raise ModelError(f"the distribution of {name} sums to {sum(row)}; it must be one: sum to 1")
         rows[numbers[name]] = RowDiagram(numbers[name], symbolic.manager.constant(0), (tuple(row),))
     return rows
-
-
-def uniform_rows(symbolic: SymbolicModel) -> Rows:
-    """The uniform distribution over all states."""
-    zero = symbolic.manager.constant(0)
-    shares = [Fraction(1, len(feature.values)) for feature in symbolic.model.features]
-    return {i: RowDiagram(i, zero, ((q,) * int(1 / q),)) for i, q in enumerate(shares)}
 
 
 # -- the choice ------------------------------------------------------------------------------------

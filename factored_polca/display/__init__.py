@@ -26,6 +26,7 @@ DRAWN_BY: Final = {
     "hierarchy.solved.StructuredTask": "task_view",
     "hierarchy.executable.TaskPolicy": "task_view",
     "hierarchy.pomdp_solved.SolvedPomdpTask": "belief_task_view",
+    "hierarchy.symbolic_task.SymbolicPomdpTask": "symbolic_task_view",
     "hierarchy.policy_file.FlatPolicy": "flat_policy_view",
     "solvers.result.MDPSolution": "solution_view",
     "simulation.simulate.Simulation": "runs_view",

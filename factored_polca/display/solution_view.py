@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from factored_polca.display.charts import BLUE, RED, Series, line_chart
@@ -9,7 +11,7 @@ from factored_polca.display.tables import heading, line, pairs, scrolled, view
 from factored_polca.display.words import count_text, number_text, plural, seconds_text
 from factored_polca.explicit.entropy_policy import EntropyPolicy
 from factored_polca.explicit.policy_graph import PolicyGraph
-from factored_polca.solvers.pomdp_result import POMDPSolution
+from factored_polca.solvers.pomdp_result import Bounds, POMDPSolution
 from factored_polca.solvers.result import MDPSolution
 
 
@@ -37,7 +39,14 @@ def html(solution: POMDPSolution | MDPSolution) -> str:
     )
 
 
-def bounds_chart(solution: POMDPSolution) -> str:
+class BoundedSolution(Protocol):
+    """What closed a gap over time."""
+
+    @property
+    def history(self) -> tuple[Bounds, ...]: ...
+
+
+def bounds_chart(solution: BoundedSolution) -> str:
     """The bounds at the initial belief against time."""
     seconds = [b.seconds for b in solution.history]
     lower = Series("lower", seconds, [b.lower for b in solution.history], BLUE, stepped=True)
@@ -48,7 +57,7 @@ def bounds_chart(solution: POMDPSolution) -> str:
     )
 
 
-def bounds_limits(solution: POMDPSolution) -> tuple[float, float]:
+def bounds_limits(solution: BoundedSolution) -> tuple[float, float]:
     """The values worth seeing: the last bounds, and what came before them, but for where it is far away."""
     last = solution.history[-1]
     lowest = min(b.lower for b in solution.history)

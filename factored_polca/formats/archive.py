@@ -80,7 +80,7 @@ class Archive:
 
     def within(self, prefix: str) -> Archive:
         """The same archive, the names of its arrays without `prefix`."""
-        return Archive(self._archive, prefix)
+        return Archive(self._archive, self._prefix + prefix)
 
     def text(self, name: str) -> str:
         """The text of an entry."""

@@ -22,15 +22,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, Diagram, dump, load, support
 from factored_polca.formats import read_native, write_native
-from factored_polca.formats.archive import is_archive_with, reading, write_archive
+from factored_polca.formats.archive import Archive, is_archive_with, reading, write_archive
 from factored_polca.models import Model
 from factored_polca.structured.pomdp_lower import Alpha
 from factored_polca.structured.pomdp_model import Seen
 from factored_polca.structured.pomdp_solution import AlphaDiagrams
-from factored_polca.symbolic import compile_model
+from factored_polca.symbolic import SymbolicModel, compile_model
 
 FORMAT: Final = "factored-polca alpha-vectors as diagrams"
 VERSION: Final = 1
@@ -57,20 +58,7 @@ def save_alpha_policy(policy: AlphaDiagrams, path: str | Path, report: Mapping[s
         ModelError: no such folder, or a device or folder in the file's place.
         OSError: the file can't be written.
     """
-    symbolic = policy.symbolic
-    count = len(policy.space.pomdp.observed)
-    entries: list[tuple[int, Seen, Diagram]] = [(a, (-1,) * count, d) for a, d in policy.blind]
-    entries += [(x.action, y, x.diagram) for y, alphas in policy.slices.items() for x in alphas]
-    dumps = [dump(diagram) for _, _, diagram in entries]
-    sizes = [[len(d["levels"]), len(d["children"]), len(d["leaves"])] for d in dumps]
-    arrays = {
-        "actions": np.array([action for action, _, _ in entries], dtype=np.int64),
-        "seen": np.array([y for _, y, _ in entries], dtype=np.int64).reshape(len(entries), count),
-        "sizes": np.array(sizes, dtype=np.int64).reshape(len(entries), 3),
-        "levels": np.concatenate([d["levels"] for d in dumps]).astype(np.int64),
-        "children": np.concatenate([d["children"] for d in dumps]).astype(np.int64),
-        "leaves": np.concatenate([d["leaves"] for d in dumps]).view(np.float64),
-    }
+    symbolic, arrays = policy.symbolic, alpha_arrays(policy)
     head = {"format": FORMAT, "version": VERSION, "order": list(symbolic.order), "report": dict(report)}
     texts = {
         HEAD: json.dumps(head, indent=1, allow_nan=False),
@@ -108,35 +96,64 @@ def load_alpha_policy(path: str | Path, *, memory_limit: int | None = None) -> A
         if not isinstance(report, dict):
             raise ValueError("its report is no object")
         symbolic = compile_model(model, order=order, memory_limit=memory_limit)
-        actions, seen = archive.array("actions", "integers"), archive.array("seen", "integers", 2)
-        sizes = archive.array("sizes", "integers", 2)
-        parts = [archive.array(name, "integers") for name in ("levels", "children")]
-        parts.append(archive.array("leaves", "numbers"))
-        observed = [i for i, f in enumerate(model.features) if f.observed]
-        hidden = {2 * symbolic.positions[i] for i in range(len(model.features))}
-        if seen.shape != (len(actions), len(observed)) or sizes.shape != (len(actions), 3):
-            raise ValueError("its arrays do not fit together")
-        if len(actions) == 0 or actions.min() < 0 or actions.max() >= len(model.actions):
-            raise ValueError("an alpha-vector has no action of the model")
-        ends = np.cumsum(sizes, axis=0)
-        if sizes.min() < 0 or any(ends[-1, i] != len(part) for i, part in enumerate(parts)):
-            raise ValueError("its diagrams do not fit together")
-        blind: list[tuple[int, Diagram]] = []
-        slices: dict[Seen, list[Alpha]] = {}
-        for number, action in enumerate(actions.tolist()):
-            begin, end = ends[number] - sizes[number], ends[number]
-            names_of = ("levels", "children", "leaves")
-            piece = {n: p[b:e] for n, p, b, e in zip(names_of, parts, begin, end, strict=True)}
-            piece["leaves"] = piece["leaves"].view(np.int64)
-            diagram = load(symbolic.manager, piece, FLOAT)
-            if not set(support(diagram)) <= hidden:
-                raise ValueError("a diagram is of other variables than the features")
-            y: Seen = tuple(int(v) for v in seen[number])
-            if all(v == -1 for v in y) and (y or not blind):
-                blind.append((action, diagram))
-            elif all(0 <= v < len(model.features[i].values) for i, v in zip(observed, y, strict=True)):
-                slices.setdefault(y, []).append(Alpha(y, action, diagram))
-            else:
-                raise ValueError("an alpha-vector is of values that are not to be seen")
-    policy = AlphaDiagrams(symbolic, tuple(blind), {y: tuple(a) for y, a in slices.items()})
+        policy = read_alphas(archive, symbolic, len(model.actions))
     return AlphaPolicy(policy, report)
+
+
+def alpha_arrays(policy: AlphaDiagrams) -> dict[str, npt.NDArray[Any]]:
+    """The alpha-vectors of a policy as arrays; see the module's docstring."""
+    count = len(policy.space.pomdp.observed)
+    entries: list[tuple[int, Seen, Diagram]] = [(a, (-1,) * count, d) for a, d in policy.blind]
+    entries += [(x.action, y, x.diagram) for y, alphas in policy.slices.items() for x in alphas]
+    dumps = [dump(diagram) for _, _, diagram in entries]
+    sizes = [[len(d["levels"]), len(d["children"]), len(d["leaves"])] for d in dumps]
+    return {
+        "actions": np.array([action for action, _, _ in entries], dtype=np.int64),
+        "seen": np.array([y for _, y, _ in entries], dtype=np.int64).reshape(len(entries), count),
+        "sizes": np.array(sizes, dtype=np.int64).reshape(len(entries), 3),
+        "levels": np.concatenate([d["levels"] for d in dumps]).astype(np.int64),
+        "children": np.concatenate([d["children"] for d in dumps]).astype(np.int64),
+        "leaves": np.concatenate([d["leaves"] for d in dumps]).view(np.float64),
+    }
+
+
+def read_alphas(archive: Archive, symbolic: SymbolicModel, count: int) -> AlphaDiagrams:
+    """The policy of `alpha_arrays`, its actions being fewer than `count`.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    actions, seen = archive.array("actions", "integers"), archive.array("seen", "integers", 2)
+    sizes = archive.array("sizes", "integers", 2)
+    parts = [archive.array(name, "integers") for name in ("levels", "children")]
+    parts.append(archive.array("leaves", "numbers"))
+    model = symbolic.model
+    observed = [i for i, f in enumerate(model.features) if f.observed]
+    hidden = {2 * symbolic.positions[i] for i in range(len(model.features))}
+    if seen.shape != (len(actions), len(observed)) or sizes.shape != (len(actions), 3):
+        raise ValueError("its arrays do not fit together")
+    if len(actions) == 0 or actions.min() < 0 or actions.max() >= count:
+        raise ValueError("an alpha-vector has no action of the model")
+    ends = np.cumsum(sizes, axis=0)
+    if sizes.min() < 0 or any(ends[-1, i] != len(part) for i, part in enumerate(parts)):
+        raise ValueError("its diagrams do not fit together")
+    blind: list[tuple[int, Diagram]] = []
+    slices: dict[Seen, list[Alpha]] = {}
+    for number, action in enumerate(actions.tolist()):
+        begin, end = ends[number] - sizes[number], ends[number]
+        names_of = ("levels", "children", "leaves")
+        piece = {n: p[b:e] for n, p, b, e in zip(names_of, parts, begin, end, strict=True)}
+        piece["leaves"] = piece["leaves"].view(np.int64)
+        diagram = load(symbolic.manager, piece, FLOAT)
+        if not set(support(diagram)) <= hidden:
+            raise ValueError("a diagram is of other variables than the features")
+        y: Seen = tuple(int(v) for v in seen[number])
+        if all(v == -1 for v in y) and (y or not blind):
+            blind.append((action, diagram))
+        elif all(0 <= v < len(model.features[i].values) for i, v in zip(observed, y, strict=True)):
+            slices.setdefault(y, []).append(Alpha(y, action, diagram))
+        else:
+            raise ValueError("an alpha-vector is of values that are not to be seen")
+    if not blind:
+        raise ValueError("no alpha-vector is of the whole state")
+    return AlphaDiagrams(symbolic, tuple(blind), {y: tuple(a) for y, a in slices.items()})

@@ -16,7 +16,7 @@ from factored_polca.solvers.pomdp_choose import POMDP_METHODS
 from factored_polca.solvers.protocol import load_solver
 from factored_polca.symbolic import SymbolicModel
 
-TASK_METHODS: Final = tuple(method for method in POMDP_METHODS if method != "witness")
+TASK_METHODS: Final = (*(method for method in POMDP_METHODS if method != "witness"), "symbolic")
 """Solvers of a task whose state is not seen; the witness algorithm needs a horizon, which tasks lack."""
 
 

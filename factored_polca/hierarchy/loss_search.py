@@ -22,6 +22,7 @@ from factored_polca.hierarchy.pomdp_plan import (
     solved_pomdp_tasks,
 )
 from factored_polca.hierarchy.solved import StructuredTask
+from factored_polca.hierarchy.symbolic_task import SymbolicPomdpTask
 from factored_polca.models import Fault, Model, ModelError, TaskHierarchy, flat_task
 from factored_polca.symbolic import compile_model
 
@@ -62,7 +63,11 @@ def plan_within_loss(
         solve = solved_tasks if seen else solved_pomdp_tasks
         solved = solve(symbolic, hierarchy, chosen, progress)
         losses = [one.approximation.loss for one in solved if one.approximation is not None]
-        blocks = [one.reduction.partition.blocks for one in solved if not isinstance(one, StructuredTask)]
+        blocks = [
+            one.reduction.partition.blocks
+            for one in solved
+            if not isinstance(one, (StructuredTask, SymbolicPomdpTask))
+        ]
         return Trial(epsilon, sum(blocks), max(losses))
 
     found, tried = largest_within(candidates(symbolic, seen=seen), loss, attempt)

@@ -16,6 +16,9 @@ FLAT_BLOCK_LIMIT: Final = 100_000
 STRUCTURED_BLOCKS: Final = 250_000
 """Blocks up to which a task whose state is seen is solved over blocks."""
 
+SYMBOLIC_BLOCKS: Final = 10_000
+"""Blocks up to which a task whose state is not seen is solved over blocks."""
+
 TRIALS: Final = 100
 """Trials of the search that solves a task whose state is not seen, at most."""
 
@@ -35,7 +38,9 @@ class Options:
 
     For those whose state is not (PolCA+) solvers stop where upper - lower <= `gap` at the initial belief,
     and for children at all corners, and after `trials` trials; `gap` None is a thousandth of the span of
-    the task's rewards.  `maximum_observations` caps the joint observations of one action of a task.
+    the task's rewards.  Where the quotient of a task with the solver "auto" has more than
+    `symbolic_blocks` blocks, or takes more memory than there is, the task is solved on diagrams: `solver`
+    "symbolic".  `maximum_observations` caps the joint observations of one action of a task.
     `assume_observed` plans a partially observed model as if the state were seen (PolCA).
 
     `interchangeable` tells actions by what they do and not by their names, where the state is seen.
@@ -62,3 +67,4 @@ class Options:
     interchangeable: bool = False
     merge_within: Fraction | float | str | None = None
     structured_blocks: int | None = STRUCTURED_BLOCKS
+    symbolic_blocks: int | None = SYMBOLIC_BLOCKS

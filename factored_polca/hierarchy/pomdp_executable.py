@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from factored_polca.approximation.snap import Snapped, snap
-from factored_polca.diagrams import INDEX, Diagram, choose, relabel
+from factored_polca.diagrams import INDEX, Diagram, choose, pairs, relabel
+from factored_polca.diagrams.operations import leaf_payloads
 from factored_polca.drawn import DrawnGraph, Framed
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import BoolArray, IntArray
@@ -21,9 +22,14 @@ from factored_polca.explicit.subtask import primitives_below
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
 from factored_polca.hierarchy.pomdp_solved import BeliefPolicy
 from factored_polca.hierarchy.subtask import local_reward, planning_channels, subtask_process
+from factored_polca.hierarchy.symbolic_task import SymbolicPomdpTask
 from factored_polca.minimisation import DecisionProcess, Partition, PomdpQuotient, make_pomdp_quotient
-from factored_polca.models import Model, TaskHierarchy
+from factored_polca.models import Model, ModelError, Task, TaskHierarchy
 from factored_polca.solvers.pomdp_choose import solve_pomdp
+from factored_polca.structured.pomdp_belief import BeliefSpace
+from factored_polca.structured.pomdp_model import FactoredPOMDP
+from factored_polca.structured.pomdp_solution import AlphaDiagrams
+from factored_polca.structured.process_model import process_model
 from factored_polca.symbolic import SymbolicModel, Term
 
 OBSERVATIONS: Final = 1_000_000
@@ -36,15 +42,42 @@ class BeliefTask:
 
     `corner[b]` is the number of the one of `actions` that it chooses where it is certain of block b;
     `terminal[b]` says whether it has ended there, and `ended` is the same as a condition on states.
+
+    A task that was solved on diagrams (`on_diagrams`) has alpha-vectors over the state, which are asked at
+    the whole belief; its blocks are the states where it does the same.
     """
 
     name: str
     actions: tuple[str, ...]
     partition: Partition
-    policy: BeliefPolicy
+    policy: BeliefPolicy | AlphaDiagrams
     corner: IntArray
     terminal: BoolArray
     ended: Diagram
+
+    @property
+    def on_diagrams(self) -> bool:
+        """Whether its policy is one of alpha-vectors as diagrams."""
+        return isinstance(self.policy, AlphaDiagrams)
+
+    @property
+    def diagrams(self) -> list[Diagram]:
+        """Its alpha-vectors where they are diagrams."""
+        if not isinstance(self.policy, AlphaDiagrams):
+            return []
+        sliced = [alpha.diagram for alphas in self.policy.slices.values() for alpha in alphas]
+        return [*(diagram for _, diagram in self.policy.blind), *sliced]
+
+    @property
+    def over_blocks(self) -> BeliefPolicy:
+        """Its policy over beliefs on its blocks.
+
+        Raises:
+            ModelError: it was solved on diagrams.
+        """
+        if isinstance(self.policy, AlphaDiagrams):
+            raise ModelError(f"task {self.name!r} was solved on diagrams: it has no policy over blocks")
+        return self.policy
 
 
 @dataclass(frozen=True)
@@ -129,9 +162,16 @@ class ExecutablePomdpPlan(DrawnGraph, Framed):
             self.known[key] = make_pomdp_quotient(process, partition, maximum_observations=OBSERVATIONS)
         return self.known[key]  # type: ignore[no-any-return]
 
+    def follow(self, name: str) -> BeliefSpace:
+        """What follows a belief under the actions of task `name`, children doing what they do when sure."""
+        key = f"space {name}"
+        if key not in self.known:
+            self.known[key] = BeliefSpace(FactoredPOMDP(process_model(self.process(name))))
+        return self.known[key]  # type: ignore[no-any-return]
+
     def values(self, name: str) -> AlphaVectors:
         """A value function of task `name`: that of its policy, or QMDP's where the policy has none."""
-        policy = self.policies[name].policy
+        policy = self.policies[name].over_blocks
         if isinstance(policy, AlphaVectors):
             return policy
         key = f"values {name}"
@@ -150,7 +190,13 @@ def executable_pomdp(plan: PomdpPlan, report: Mapping[str, Any] | None = None) -
     """What execution needs of a plan."""
     policies, known = dict[str, BeliefTask](), dict[str, Any]()
     for solved in plan.solved:
-        name, quotient = solved.task.name, solved.reduction.pomdp_quotient
+        name = solved.task.name
+        known[f"policy {name}"] = solved.policy
+        if isinstance(solved, SymbolicPomdpTask):
+            ended = solved.process.terminal
+            policies[name] = task_on_diagrams(solved.task, solved.solution.policy, solved.corner, ended)
+            continue
+        quotient = solved.reduction.pomdp_quotient
         policies[name] = BeliefTask(
             name,
             solved.task.actions,
@@ -160,11 +206,20 @@ def executable_pomdp(plan: PomdpPlan, report: Mapping[str, Any] | None = None) -
             quotient.pomdp.terminal,
             quotient.process.terminal,
         )
-        known[f"policy {name}"] = solved.policy
         known[f"quotient {name}"] = quotient
     return ExecutablePomdpPlan(
         plan.symbolic, plan.tasks, plan.root.task.name, policies, dict(report or {}), known
     )
+
+
+def task_on_diagrams(task: Task, policy: AlphaDiagrams, corner: Diagram, ended: Diagram) -> BeliefTask:
+    """A task that was solved on diagrams; `corner` maps states to the action chosen when certain."""
+    manager = policy.symbolic.manager
+    joint, chosen, over = pairs(corner, ended)
+    partition = Partition(policy.symbolic, joint, len(chosen), False)
+    actions = leaf_payloads(manager, chosen).astype(np.int64)
+    terminal = leaf_payloads(manager, over) == 1
+    return BeliefTask(task.name, task.actions, partition, policy, actions, terminal, ended)
 
 
 def _composed(plan: ExecutablePomdpPlan, task: BeliefTask) -> Diagram:

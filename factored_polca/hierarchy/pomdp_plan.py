@@ -41,12 +41,22 @@ from factored_polca.hierarchy.check import (
 from factored_polca.hierarchy.merging import CertifiedBounds, limits_named, merging_for
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.pomdp_solved import (
+    RELATIVE_GAP,
     BeliefPolicy,
     SolvedPomdpTask,
     corner_choices,
     root_beliefs,
 )
+from factored_polca.hierarchy.structured_task import ASKED_FOR, can_fall_back
 from factored_polca.hierarchy.subtask import planning_channels, refuse_without_purpose, subtask_process
+from factored_polca.hierarchy.symbolic_task import (
+    SYMBOLIC,
+    AnySolvedPomdpTask,
+    SymbolicPomdpTask,
+    limits_of,
+    solve_on_diagrams,
+    upper_on_diagrams,
+)
 from factored_polca.hierarchy.time_limit import PlanStatus, cut_short_text, plan_status, search_deadline
 from factored_polca.minimisation import DecisionProcess, Reduction, flat_process, reduce
 from factored_polca.models import Fault, LimitReached, Model, ModelError, Task, TaskHierarchy, flat_task
@@ -60,9 +70,6 @@ Progress = Callable[[str, str, int, int], None]
 
 SEARCHES: Final = ("auto", "exact", "sarsop", "hsvi", "pbvi", "perseus")
 """Methods that go on until a gap is reached, or for `Options.trials`."""
-
-RELATIVE_GAP: Final = 1e-3
-"""upper - lower asked for, as a share of the span of a task's rewards, unless a gap is given."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,7 @@ class PomdpPlan(DrawnGraph, Framed):
 
     symbolic: SymbolicModel
     tasks: TaskHierarchy
-    solved: tuple[SolvedPomdpTask, ...]
+    solved: tuple[AnySolvedPomdpTask, ...]
     flat: FlatBound
     seconds: float
     warnings: tuple[str, ...] = field(default=())
@@ -94,7 +101,7 @@ class PomdpPlan(DrawnGraph, Framed):
         return f"<PomdpPlan of {self.model.name}: {len(self.solved)} tasks>"
 
     @property
-    def root(self) -> SolvedPomdpTask:
+    def root(self) -> AnySolvedPomdpTask:
         """The task at the top."""
         return self.solved[-1]
 
@@ -108,7 +115,7 @@ class PomdpPlan(DrawnGraph, Framed):
         """Whether a limit cut the search of a task short."""
         return plan_status(solved.solution.status for solved in self.solved)
 
-    def task(self, name: str) -> SolvedPomdpTask:
+    def task(self, name: str) -> AnySolvedPomdpTask:
         """The solved task called `name`.
 
         Raises:
@@ -162,7 +169,7 @@ def plan_pomdp(
 
 def solved_pomdp_tasks(
     symbolic: SymbolicModel, hierarchy: TaskHierarchy, options: Options, progress: Progress | None
-) -> tuple[SolvedPomdpTask, ...]:
+) -> tuple[AnySolvedPomdpTask, ...]:
     """The tasks of a checked hierarchy solved, and no more than that; the root comes last."""
     planner = _Planner(symbolic, hierarchy, options, progress)
     for task in planning_order(hierarchy):
@@ -203,7 +210,7 @@ class _Planner:
     ) -> None:
         self.symbolic, self.hierarchy = symbolic, hierarchy
         self.options, self.progress = options, progress
-        self.solved: dict[str, SolvedPomdpTask] = {}
+        self.solved: dict[str, AnySolvedPomdpTask] = {}
         self.custom = custom_solver(options.solver)
         self.merging = merging_for(symbolic, options)
         self.reachable: Diagram | None = None
@@ -219,29 +226,60 @@ class _Planner:
             self.progress(task, stage, number, blocks)
 
     def reduce(self, name: str, process: DecisionProcess, block_limit: int | None) -> Reduction:
-        try:
-            return reduce(
-                process,
-                seed=self.options.seed,
-                block_limit=block_limit,
-                progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
-                maximum_observations=self.options.maximum_observations,
-            )
-        except LimitReached as error:
-            raise LimitReached(f"task {name!r}: {error}", error.stage, error.partial) from None
+        return reduce(
+            process,
+            seed=self.options.seed,
+            block_limit=block_limit,
+            progress=lambda number, blocks: self.tell(name, "minimise", number, blocks),
+            maximum_observations=self.options.maximum_observations,
+        )
 
-    def merged(self, name: str, process: DecisionProcess) -> Reduction:
-        """A task's reduction: exact, or of a process near it."""
+    def merged(self, task: Task, process: DecisionProcess, method: str) -> Reduction | str:
+        """A task's reduction: exact, or of a process near it; or why it is to be solved on diagrams."""
+        name = task.name
         if self.merging is None:
-            return self.reduce(name, process, self.options.block_limit)
+            return self.reduced(task, process, method)
+        if method == SYMBOLIC:
+            message = f"task {name!r}: merging near states needs blocks, and {SYMBOLIC!r} makes none"
+            raise ModelError([Fault(message, ("tasks", name, "solver"), "choose one of them")])
+        return self.merging.reduce(
+            process,
+            self.options.block_limit,
+            lambda number, blocks: self.tell(name, "merge", number, blocks),
+        )
+
+    def reduced(self, task: Task, process: DecisionProcess, method: str) -> Reduction | str:
+        """The reduction of a process, or why it is to be solved on diagrams."""
+        if method == SYMBOLIC:
+            return ASKED_FOR
+        options = self.options
+        falls_back = method == "auto" and (self.custom is None or task.solver is not None)
+        limit = options.block_limit
+        if falls_back and options.symbolic_blocks is not None:
+            limit = min(options.symbolic_blocks, limit or options.symbolic_blocks)
         try:
-            return self.merging.reduce(
-                process,
-                self.options.block_limit,
-                lambda number, blocks: self.tell(name, "merge", number, blocks),
-            )
+            return self.reduce(task.name, process, limit)
         except LimitReached as error:
-            raise LimitReached(f"task {name!r}: {error}", error.stage, error.partial) from None
+            strict = limit == options.block_limit
+            if not falls_back or "joint observations" in str(error) or not can_fall_back(error, strict):
+                raise
+            return f"no quotient ({error})"
+        except MemoryLimit as error:
+            if not falls_back:
+                raise
+            return f"no quotient ({error})"
+
+    def on_diagrams(self, task: Task, process: DecisionProcess, reason: str) -> AnySolvedPomdpTask:
+        """Steps 2 to 4 without a quotient."""
+
+        def progress(lower: float, upper: float) -> None:
+            self.tell(task.name, f"the value lies in {lower:.6g} .. {upper:.6g}")
+
+        left = len(self.hierarchy.tasks) - len(self.solved)
+        is_root = task in self.hierarchy.roots()
+        return solve_on_diagrams(
+            task, process, self.options, reason, is_root=is_root, shares=left + 1, progress=progress
+        )
 
     def solve(self, task: Task) -> None:
         """Steps 1 to 4 of the module's docstring for one task."""
@@ -250,7 +288,12 @@ class _Planner:
         method = pomdp_solver_of(task, named_solver(self.options.solver))
         channels = planning_channels(self.symbolic.model, task)
         process = subtask_process(self.symbolic, task, self.solved, self.reachable, channels)
-        reduction = self.merged(task.name, process)
+        with limits_of(task.name):
+            reduction = self.merged(task, process, method)
+        if isinstance(reduction, str):
+            self.solved[task.name] = self.on_diagrams(task, process, reduction)
+            self.tell(task.name, "done")
+            return
         quotient = reduction.pomdp_quotient
         if self.merging is None or not self.merging.has_purpose(process):
             refuse_without_purpose(task, quotient.mdp)
@@ -297,9 +340,7 @@ class _Planner:
         root = self.solved[planning_order(self.hierarchy)[-1].name]
         if self.merging is None:
             return None
-        process = flat_process(
-            self.symbolic, reachable=self.reachable, terminal=root.reduction.process.terminal
-        )
+        process = flat_process(self.symbolic, reachable=self.reachable, terminal=root.process.terminal)
         note = "what the polled policy earns is measured"
         try:
             reduction = self.merging.reduce(process, self.options.block_limit)
@@ -322,10 +363,11 @@ class _Planner:
             return FlatBound(None, None, "the root has a reward of its own")
         self.tell("flat bound", "parameterise")
         try:
-            process = flat_process(
-                self.symbolic, reachable=self.reachable, terminal=root.reduction.process.terminal
-            )
-            reduction = self.reduce("flat bound", process, limit)
+            process = flat_process(self.symbolic, reachable=self.reachable, terminal=root.process.terminal)
+            if any(isinstance(solved, SymbolicPomdpTask) for solved in self.solved.values()):
+                return self.flat_on_diagrams(process, root)
+            with limits_of("flat bound"):
+                reduction = self.reduce("flat bound", process, limit)
         except (LimitReached, MemoryLimit, Aborted) as error:
             return FlatBound(None, None, f"left out: {error}")
         pomdp = reduction.pomdp_quotient.pomdp
@@ -334,6 +376,17 @@ class _Planner:
         if found.status == "interrupted":
             raise KeyboardInterrupt
         return FlatBound(found.upper, pomdp.states, "fast informed bound on the flat quotient")
+
+    def flat_on_diagrams(self, process: DecisionProcess, root: AnySolvedPomdpTask) -> FlatBound:
+        """The same without a quotient."""
+        primitives = tuple(action.name for action in self.symbolic.actions)
+        if root.task.actions == primitives:
+            return FlatBound(root.upper, None, "the plan is flat")
+        try:
+            upper = upper_on_diagrams(process, self.options)
+        except LimitReached as error:
+            return FlatBound(None, None, f"left out: {error}")
+        return FlatBound(upper, None, "fast informed bound on diagrams, without a quotient")
 
 
 def refuse_memory(solution: POMDPSolution, name: str) -> None:

@@ -4,6 +4,7 @@
                        printed), and "tasks": for each its name, "blocks", "outside" (whether states are
                        left out), and the "kind" and "head" of its policy
     model.toml         the model and its tasks
+    taskN.alphas.NAME  the policy of a task that was solved on diagrams (`alpha_policy_file`)
     taskN.NAME         the diagram of task N's partition by nodes (levels, children, leaves), what it does
                        where it is certain (corner), and its policy (`formats.policy_arrays`)
 
@@ -22,10 +23,12 @@ import numpy.typing as npt
 from factored_polca.diagrams import INDEX, dump, evaluate_states, leaves, load
 from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.entropy_policy import EntropyPolicy
+from factored_polca.explicit.policies import AnyPolicy
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
 from factored_polca.formats import read_native, write_native
 from factored_polca.formats.archive import Archive, is_archive_with, reading, write_archive
 from factored_polca.formats.policy_arrays import read_policy, stored_policy
+from factored_polca.hierarchy.alpha_policy_file import alpha_arrays, read_alphas
 from factored_polca.hierarchy.check import checked
 from factored_polca.hierarchy.pomdp_executable import BeliefTask, ExecutablePomdpPlan
 from factored_polca.hierarchy.subtask import ended_condition
@@ -33,11 +36,13 @@ from factored_polca.minimisation import Partition
 from factored_polca.minimisation.pomdp_quotient import seen_of_blocks
 from factored_polca.minimisation.quotient import feature_states
 from factored_polca.models import Task
+from factored_polca.structured.pomdp_solution import AlphaDiagrams
 from factored_polca.symbolic import SymbolicModel, compile_model
 
 FORMAT: Final = "factored-polca belief plan"
 VERSION: Final = 1
 HEAD: Final = "belief-plan.json"
+ON_DIAGRAMS: Final = "alpha-vectors as diagrams"
 
 
 def save_pomdp_plan(plan: ExecutablePomdpPlan, path: str | Path) -> None:
@@ -50,17 +55,17 @@ def save_pomdp_plan(plan: ExecutablePomdpPlan, path: str | Path) -> None:
     """
     tasks, arrays = [], dict[str, npt.NDArray[Any]]()
     for number, task in enumerate(plan.policies.values()):
-        stored = stored_policy(task.policy)
+        kind, head, kept = _stored(task)
         tasks.append(
             {
                 "name": task.name,
                 "blocks": task.partition.blocks,
                 "outside": task.partition.has_outside,
-                "kind": stored.kind,
-                "head": dict(stored.head),
+                "kind": kind,
+                "head": head,
             }
         )
-        mine = {**dump(task.partition.diagram), "corner": task.corner, **stored.arrays}
+        mine = {**dump(task.partition.diagram), "corner": task.corner, **kept}
         arrays |= {f"task{number}.{name}": array for name, array in mine.items()}
     head = {
         "format": FORMAT,
@@ -75,6 +80,14 @@ def save_pomdp_plan(plan: ExecutablePomdpPlan, path: str | Path) -> None:
         "model.toml": write_native(plan.model, plan.tasks),
     }
     write_archive(path, texts, arrays)
+
+
+def _stored(task: BeliefTask) -> tuple[str, dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """The kind of a task's policy, what JSON holds of it, and its arrays."""
+    if isinstance(task.policy, AlphaDiagrams):
+        return ON_DIAGRAMS, {}, {f"alphas.{name}": a for name, a in alpha_arrays(task.policy).items()}
+    stored = stored_policy(task.policy)
+    return stored.kind, dict(stored.head), dict(stored.arrays)
 
 
 def is_pomdp_plan_file(path: str | Path) -> bool:
@@ -134,8 +147,12 @@ def _task(archive: Archive, entry: dict[str, Any], task: Task, symbolic: Symboli
     partition = Partition(symbolic, diagram, blocks, outside)
     states, ended = feature_states(partition), ended_condition(symbolic, task)
     terminal = evaluate_states(ended, states, symbolic.columns()).astype(np.bool_)
-    policy = read_policy(entry["kind"], entry["head"], archive, _stub(task, terminal, symbolic, states))
-    if not isinstance(policy, (AlphaVectors, EntropyPolicy)):
+    policy: AnyPolicy | AlphaDiagrams
+    if entry["kind"] == ON_DIAGRAMS:
+        policy = read_alphas(archive.within("alphas."), symbolic, len(task.actions))
+    else:
+        policy = read_policy(entry["kind"], entry["head"], archive, _stub(task, terminal, symbolic, states))
+    if not isinstance(policy, (AlphaVectors, EntropyPolicy, AlphaDiagrams)):
         raise ValueError("a task's policy is no map from beliefs")
     corner = archive.array("corner", "integers")
     if corner.shape != (blocks,) or corner.min() < 0 or corner.max() >= len(task.actions):

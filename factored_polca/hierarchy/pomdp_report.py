@@ -10,6 +10,7 @@ from factored_polca.hierarchy.plan import HierarchicalPlan
 from factored_polca.hierarchy.pomdp_plan import PomdpPlan
 from factored_polca.hierarchy.pomdp_solved import SolvedPomdpTask
 from factored_polca.hierarchy.solved import StructuredTask
+from factored_polca.hierarchy.symbolic_task import AnySolvedPomdpTask, SymbolicPomdpTask
 
 
 def pomdp_plan_report(
@@ -20,7 +21,7 @@ def pomdp_plan_report(
     `polca` is the same hierarchy planned as if the state were seen, for its number of parameters.  The
     number without abstraction takes listing all states, which `list_states` may forbid.
     """
-    processes = [solved.reduction.process for solved in plan.solved]
+    processes = [solved.process for solved in plan.solved]
     none = unreduced_parameters(plan.symbolic, processes) if list_states else None
     tasks = [
         task_report(solved)
@@ -28,7 +29,7 @@ def pomdp_plan_report(
             "parameters": {
                 "none": None if none is None else none[number],
                 "polca": None if polca is None else polca_parameters(polca, solved.task.name),
-                "polca_plus": pomdp_parameters(solved.reduction.pomdp_quotient.pomdp),
+                "polca_plus": task_parameters(solved),
             }
         }
         for number, solved in enumerate(plan.solved)
@@ -66,17 +67,20 @@ def total(tasks: list[dict[str, Any]], key: str) -> int | None:
     return None if None in counts else sum(counts)
 
 
-def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
-    """Figures of one task."""
-    quotient, solution = solved.reduction.pomdp_quotient, solved.solution
-    before, after = quotient.observations_before, quotient.observations_after
+def task_parameters(solved: AnySolvedPomdpTask) -> int | None:
+    """The parameters of one task's model; None where it was solved without a quotient."""
+    if isinstance(solved, SymbolicPomdpTask):
+        return None
+    return pomdp_parameters(solved.reduction.pomdp_quotient.pomdp)
+
+
+def task_report(solved: AnySolvedPomdpTask) -> dict[str, Any]:
+    """Figures of one task; those of blocks are None where it was solved without a quotient."""
+    solution = solved.solution
     return {
         "name": solved.task.name,
         "actions": list(solved.task.actions),
-        "blocks": solved.reduction.partition.blocks,
-        "observations": {
-            name: {"before": before[c], "after": after[c]} for c, name in enumerate(solved.task.actions)
-        },
+        **quotient_report(solved),
         "observes": None if solved.task.observes is None else list(solved.task.observes),
         "lower": solved.lower,
         "upper": solved.upper,
@@ -86,15 +90,33 @@ def task_report(solved: SolvedPomdpTask) -> dict[str, Any]:
         "guarantee": task_guarantee(solved),
         "vectors": solution.vectors,
         "iterations": solution.iterations,
-        "ties": solved.ties,
-        "collision_bound": solved.reduction.minimisation.collision_bound,
-        "minimise_seconds": solved.minimise_seconds,
         "seconds": solved.seconds,
         **approximation_report(solved.approximation),
     }
 
 
-def task_guarantee(solved: SolvedPomdpTask) -> str:
+def quotient_report(solved: AnySolvedPomdpTask) -> dict[str, Any]:
+    """What a task's report says of its quotient, or why there is none."""
+    if isinstance(solved, SymbolicPomdpTask):
+        left_out = dict.fromkeys(("blocks", "observations", "ties", "collision_bound", "minimise_seconds"))
+        note = "; ".join(part for part in (solved.reason, solved.solution.note) if part)
+        return left_out | {"nodes": solved.solution.policy.nodes, "note": note}
+    quotient = solved.reduction.pomdp_quotient
+    before, after = quotient.observations_before, quotient.observations_after
+    return {
+        "blocks": solved.reduction.partition.blocks,
+        "observations": {
+            name: {"before": before[c], "after": after[c]} for c, name in enumerate(solved.task.actions)
+        },
+        "ties": solved.ties,
+        "collision_bound": solved.reduction.minimisation.collision_bound,
+        "minimise_seconds": solved.minimise_seconds,
+        "nodes": None,
+        "note": "",
+    }
+
+
+def task_guarantee(solved: AnySolvedPomdpTask) -> str:
     """How far the bounds of a task may be trusted, in words."""
     text = solved.solution.guarantee.text
     if solved.task.observes is None:
@@ -104,12 +126,18 @@ def task_guarantee(solved: SolvedPomdpTask) -> str:
 
 def guarantee(plan: PomdpPlan) -> str:
     """How far the values may be trusted, in words."""
-    chance = sum(solved.reduction.minimisation.collision_bound for solved in plan.solved)
+    reduced = [solved for solved in plan.solved if isinstance(solved, SolvedPomdpTask)]
+    chance = sum(solved.reduction.minimisation.collision_bound for solved in reduced)
     if plan.root.approximation is not None:
         return merging_text(plan.root.approximation, plan.certified)
     certified = plan.certified is not None and plan.certified.polled_lower is not None
-    return (
+    text = (
         "each task's bounds hold in its own model, given what its children do where they are certain; what "
-        f"the polled policy earns is measured{' and certified' if certified else ''}; each partition exact "
-        f"but for a chance below {max(chance, 1e-300):.1g}"
+        f"the polled policy earns is measured{' and certified' if certified else ''}"
     )
+    if reduced:
+        text += f"; each partition exact but for a chance below {max(chance, 1e-300):.1g}"
+    names = [solved.task.name for solved in plan.solved if isinstance(solved, SymbolicPomdpTask)]
+    if names:
+        text += f"; solved on diagrams, without a quotient: {', '.join(names)}"
+    return text

@@ -19,11 +19,14 @@ from factored_polca.explicit.alpha_vectors import AlphaVectors
 from factored_polca.explicit.arrays import FloatArray, IntArray
 from factored_polca.explicit.entropy_policy import EntropyPolicy
 from factored_polca.explicit.pomdp_arrays import ArrayPOMDP
-from factored_polca.minimisation import Reduction
+from factored_polca.minimisation import DecisionProcess, Reduction
 from factored_polca.models import Task
 from factored_polca.solvers.pomdp_result import POMDPSolution
 
 TIE: Final = 1e-9
+
+RELATIVE_GAP: Final = 1e-3
+"""upper - lower asked for, as a share of the span of a task's rewards, unless a gap is given."""
 
 BeliefPolicy: TypeAlias = AlphaVectors | EntropyPolicy
 """What a task's policy may be: a map from beliefs over its blocks to its actions."""
@@ -52,6 +55,11 @@ class SolvedPomdpTask(DrawnGraph):
     minimise_seconds: float
     warnings: tuple[str, ...] = field(default=())
     approximation: Approximation | None = None
+
+    @property
+    def process(self) -> DecisionProcess:
+        """The decision process that was solved."""
+        return self.reduction.process
 
     @property
     def lower(self) -> float:

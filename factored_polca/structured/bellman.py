@@ -24,7 +24,7 @@ changed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -130,12 +130,9 @@ class Bellman:
     def greedy(self, q_values: list[Diagram], best: Diagram, gap: float = 0.0) -> Diagram:
         """The number of the first choice whose Q-value is within the tolerance, plus `gap`, of the best;
         where there is no choice the number of choices."""
-        threshold = map_leaves(best, lambda v: v - TIE_TOLERANCE * np.maximum(1.0, np.abs(v)) - gap)
-        result = self.manager.constant(len(q_values))
-        for number in range(len(q_values) - 1, -1, -1):
-            below = apply("less", q_values[number], threshold)
-            result = choose(below, result, self.manager.constant(number))
-        return choose(self.safety.free, result, self.manager.constant(len(q_values)))
+        none = self.manager.constant(len(q_values))
+        result = first_best(list(enumerate(q_values)), best, none, gap)
+        return choose(self.safety.free, result, none)
 
     def chosen(self, policy: Diagram, q_values: list[Diagram]) -> Diagram:
         """Q of the choice that `policy` [x] -> choice takes, 0 where there is none."""
@@ -152,14 +149,32 @@ class Bellman:
 
     def primitive_policy(self, policy: Diagram) -> Diagram:
         """The primitive that a policy [x] -> choice takes; the number of the model's actions if none."""
-        result = self.manager.constant(len(self.process.symbolic.actions))
-        for number, choice in enumerate(self.process.choices):
-            taken = policy.equals(self.manager.constant(number))
-            primitive = choice.policy
-            if primitive is None:
-                primitive = self.manager.constant(choice.primitives[0])
-            result = choose(taken, primitive, result)
-        return result
+        return primitive_policy(self.process, policy)
+
+
+def primitive_policy(process: DecisionProcess, policy: Diagram) -> Diagram:
+    """The primitive that a policy [x] -> choice takes; the number of the model's actions if none."""
+    manager = process.symbolic.manager
+    result = manager.constant(len(process.symbolic.actions))
+    for number, choice in enumerate(process.choices):
+        taken = policy.equals(manager.constant(number))
+        primitive = choice.policy
+        if primitive is None:
+            primitive = manager.constant(choice.primitives[0])
+        result = choose(taken, primitive, result)
+    return result
+
+
+def first_best(
+    values: Sequence[tuple[int, Diagram]], best: Diagram, none: Diagram, gap: float = 0.0
+) -> Diagram:
+    """The first number whose value is within the tolerance, plus `gap`, of the best; else `none`."""
+    threshold = map_leaves(best, lambda v: v - TIE_TOLERANCE * np.maximum(1.0, np.abs(v)) - gap)
+    result = none
+    for number, value in reversed(values):
+        below = apply("less", value, threshold)
+        result = choose(below, result, none.manager.constant(number))
+    return result
 
 
 def leaf_values(diagram: Diagram) -> FloatArray:

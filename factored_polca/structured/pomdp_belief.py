@@ -43,6 +43,7 @@ from factored_polca.structured.alpha_forest import Forest, Remembered
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Outcome, Seen, Step
 from factored_polca.structured.pomdp_point import KEPT_BITS, PointBelief, rounded_bits
 from factored_polca.structured.pomdp_tables import OutcomeTable, StepTable
+from factored_polca.symbolic import RowDiagram
 from factored_polca.symbolic.elimination import eliminate, joined
 from factored_polca.symbolic.factors import Factor, restricted
 
@@ -313,18 +314,28 @@ class BeliefSpace:
         parts = [np.asarray(marginals[features[k].name], dtype=np.float64) for k in self.pomdp.hidden]
         return PointBelief(seen, np.concatenate([np.empty(0), *(part / part.sum() for part in parts)]))
 
+    def corner(self, state: Sequence[int]) -> PointBelief:
+        """The belief that is sure of a state, given by its value at each level."""
+        symbolic = self.pomdp.symbolic
+        marginals = np.zeros(self.entries)
+        for level in self.levels.tolist():
+            marginals[self.offset[level] + int(state[level])] = 1.0
+        return PointBelief(tuple(int(state[symbolic.now(i)]) for i in self.pomdp.observed), marginals)
+
     # -- the start -------------------------------------------------------------------------------
 
-    def starts(self) -> list[tuple[float, PointBelief]]:
+    def starts(
+        self, rows: Mapping[int, RowDiagram] | None = None, most: int = STARTS
+    ) -> list[tuple[float, PointBelief]]:
         """The initial belief: the probability of each value of what is seen, and the belief there.
 
-        Mass at terminal states is left out.
+        Mass at terminal states is left out.  `rows`, over next variables, take the place of the model's.
 
         Raises:
             LimitReached: the initial belief is too large, or has too many values of what is seen.
         """
         pomdp, symbolic = self.pomdp, self.pomdp.symbolic
-        initial = symbolic.initial
+        initial = symbolic.initial if rows is None else rows
         levels = {symbolic.next(i): symbolic.now(i) for i in initial}
         found: list[tuple[float, PointBelief]] = []
         alive = pomdp.numbers.shift(pomdp.live)
@@ -343,9 +354,9 @@ class BeliefSpace:
                         [restrict(d, {symbolic.next(i): v}) for d in [*live, restrict(part, fixed)]],
                     )
                 return
-            if len(found) >= STARTS:
+            if len(found) >= most:
                 raise LimitReached(
-                    f"at the start more than {STARTS:,} values may be seen of "
+                    f"at the start more than {most:,} values may be seen of "
                     f"{', '.join(pomdp.features[i].name for i in pomdp.observed)}; "
                     "solving on diagrams lists them",
                     "initial belief",

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, Diagram, Manager, load, node_count, support
 from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen, Step
 from factored_polca.structured.rounding import Direction, group
 
 FloatArray = npt.NDArray[np.float64]
@@ -188,6 +189,20 @@ def eliminate(function: Table, weights: Mapping[int, Table], synchronic: bool) -
         if level in function.axes:
             function = function.summed(weights[level], level)
     return function
+
+
+def step_tables(pomdp: FactoredPOMDP, step: Step) -> tuple[list[Table], dict[Seen, dict[int, Table]]]:
+    """W_o for each outcome of a step, and the distributions of the changed features at each y'."""
+    symbolic = pomdp.symbolic
+    weights: dict[Seen, dict[int, Table]] = {}
+    for (then, k), parts in step.weights.items():
+        level = symbolic.next(k)
+        whole = pomdp.branch(level, parts)
+        table = table_of(whole, sorted({*support(whole), level}))
+        weights.setdefault(then, {})[level] = table
+    for outcome in step.outcomes:
+        weights.setdefault(outcome.seen, {})
+    return [table_of(outcome.weight) for outcome in step.outcomes], weights
 
 
 def merged_cells(values: FloatArray, width: float, leaves: int, direction: Direction) -> FloatArray:

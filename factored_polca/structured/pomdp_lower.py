@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from factored_polca.diagrams import FLOAT, Diagram, choose, node_count, support
+from factored_polca.diagrams import FLOAT, Diagram, choose, node_count
 from factored_polca.structured.alpha_forest import Forest
 from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_cells import (
@@ -29,6 +29,7 @@ from factored_polca.structured.pomdp_cells import (
     TooManyCells,
     eliminate,
     merged_diagram,
+    step_tables,
     table_of,
 )
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen, Step
@@ -172,7 +173,7 @@ class LowerBound:
         moved = {symbolic.now(k): symbolic.next(k) for k in step.changed}
         try:
             if key not in self._tables:
-                self._tables[key] = self._step_tables(step)
+                self._tables[key] = step_tables(pomdp, step)
             outcomes, weights = self._tables[key]
             sums: dict[Seen, Table] = {}
             for outcome, weight, alpha in zip(step.outcomes, outcomes, chosen, strict=True):
@@ -191,19 +192,6 @@ class LowerBound:
         live = table_of(pomdp.at(step.seen, pomdp.live), self.axes).values > 0
         values = np.where(live, np.broadcast_to(total.over(self.axes), shape) - error, 0.0)
         return merged_diagram(pomdp.manager, Table(self.axes, values), self.width, self.nodes, "down")
-
-    def _step_tables(self, step: Step) -> tuple[list[Table], dict[Seen, dict[int, Table]]]:
-        """W_o for each outcome, and the distributions of the changed features at each y'."""
-        pomdp, symbolic = self.pomdp, self.pomdp.symbolic
-        weights: dict[Seen, dict[int, Table]] = {}
-        for (then, k), parts in step.weights.items():
-            level = symbolic.next(k)
-            whole = pomdp.branch(level, parts)
-            table = table_of(whole, sorted({*support(whole), level}))
-            weights.setdefault(then, {})[level] = table
-        for outcome in step.outcomes:
-            weights.setdefault(outcome.seen, {})
-        return [table_of(outcome.weight) for outcome in step.outcomes], weights
 
 
 def closure(alphas: Iterable[Alpha]) -> list[Alpha]:

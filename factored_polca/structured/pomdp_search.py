@@ -245,9 +245,11 @@ class Search:
 
     # -- trials ----------------------------------------------------------------------------------
 
-    def trial(self, target: float) -> None:
-        """One trial from the root with the largest excess."""
-        _, node = max(self.roots, key=lambda root: root[0] * (root[1].gap - target))
+    def trial(self, target: float, root: Node | None = None) -> None:
+        """One trial from `root`, or from the part of the start with the largest excess."""
+        node = root
+        if node is None:
+            _, node = max(self.roots, key=lambda root: root[0] * (root[1].gap - target))
         path: list[Node] = []
         aim = target
         for _ in range(DEEPEST):

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
 from factored_polca.diagrams import Aborted, Diagram, MemoryLimit, node_count
-from factored_polca.models import ModelError
+from factored_polca.models import LimitReached, ModelError
 from factored_polca.solvers.evaluation import TimeIsUp
 from factored_polca.solvers.interrupts import interrupts_at_polls
 from factored_polca.solvers.pomdp_result import Bounds, Demand
@@ -24,12 +24,15 @@ from factored_polca.solvers.result import Guarantee, Status
 from factored_polca.structured.pomdp_belief import BELIEF_ERROR, BeliefSpace
 from factored_polca.structured.pomdp_bounds import FirstBounds, Sizes
 from factored_polca.structured.pomdp_cell_bounds import first_bounds
+from factored_polca.structured.pomdp_corners import Corners
+from factored_polca.structured.pomdp_informed import informed_bound
 from factored_polca.structured.pomdp_lower import Alpha, AlphaSet, LowerBound, closure
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen
 from factored_polca.structured.pomdp_point import PointBelief
-from factored_polca.structured.pomdp_search import SHARE, Search, TooManyBeliefs
+from factored_polca.structured.pomdp_search import SHARE, Node, Search, TooManyBeliefs
 from factored_polca.structured.pomdp_upper import UpperBound
 from factored_polca.symbolic import SymbolicModel
+from factored_polca.symbolic.reach import uniform_rows
 
 METHOD: Final = "point-based value iteration on diagrams"
 
@@ -47,7 +50,11 @@ BELIEF_LIMIT: Final = 1_000_000
 
 BLIND_SECONDS: Final = 20.0
 QMDP_SECONDS: Final = 60.0
+INFORMED_SECONDS: Final = 120.0
 """How long the first bounds may take, where that is less than their share of the time given."""
+
+UNIFORM: Final = 100
+"""Values of what is seen, up to which the uniform belief is one to start from at each of them."""
 
 MERGED: Final = 0.1
 """Leaves are merged within this share of gap * (1 - discount), which is what merging then costs."""
@@ -86,7 +93,7 @@ class AlphaDiagrams:
         if seen not in self._sets:
             pomdp = self.space.pomdp
             blind = [Alpha(seen, a, pomdp.at(seen, d), blind=True) for a, d in self.blind]
-            self._sets[seen] = AlphaSet(pomdp, [*self.slices.get(seen, ()), *blind])
+            self._sets[seen] = AlphaSet(pomdp, [*blind, *self.slices.get(seen, ())])
         return self._sets[seen]
 
     def choose(self, belief: PointBelief) -> int:
@@ -106,6 +113,8 @@ class SymbolicSolution:
 
     `lower <= V*(b0) <= upper` whatever the status, rounding and merging included.  `projections` counts the
     outcomes whose beliefs were too large to be formed, so that the upper bound learnt nothing from them.
+    `corner_gap`, where it was solved everywhere, is the largest upper - lower at the corners, the uniform
+    belief and the initial one.
     """
 
     lower: float
@@ -123,6 +132,7 @@ class SymbolicSolution:
     seconds: float
     history: tuple[Bounds, ...]
     note: str
+    corner_gap: float | None = None
 
     @property
     def gap(self) -> float:
@@ -151,6 +161,8 @@ class _Run:
         self.blind: list[tuple[int, Diagram]] = [(0, self.first.constant(self.first.floor))]
         self.bounds = (self.first.floor, self.first.ceiling)
         self.search: Search | None = None
+        self.corners: Corners | None = None
+        self.others: list[Node] = []  # uniform beliefs
         self.trials = 0
         self.history: list[Bounds] = []
         self.notes: list[str] = []
@@ -166,7 +178,7 @@ class _Run:
             self.demand.progress(*self.bounds)
 
     def first_bounds(self) -> None:
-        """Blind policies and QMDP."""
+        """Blind policies, QMDP and the fast informed bound."""
         left = self.demand.seconds_left
         starts = self.space.starts()
 
@@ -182,7 +194,10 @@ class _Run:
         )
         if tables:
             self.notes.append("the first bounds were found on tables of all states")
-        upper = UpperBound(self.space, quality, self.first.size)
+        left = self.demand.seconds_left
+        seen = [belief.seen for _, belief in starts]
+        informed = informed_bound(self.first, seen, quality, min(INFORMED_SECONDS, left / 4))
+        upper = UpperBound(self.space, quality, self.first.size, informed, self.sizes.width)
         search = Search(
             self.space, self._lower(), upper, poll=self.demand.poll, belief_limit=self.belief_limit
         )
@@ -199,6 +214,48 @@ class _Run:
             nodes=self.alpha_nodes,
             width=self.sizes.width,
         )
+
+    def improve_everywhere(self) -> Status:
+        """Trials from the worst of the corners, the uniform belief and the start, until gaps are closed.
+
+        A belief from which a trial changed nothing is given up.
+        """
+        search = self.search
+        assert search is not None
+        self.corners = corners = Corners(search)
+        with suppress(LimitReached):
+            for _, belief in self.space.starts(uniform_rows(self.pomdp.symbolic), UNIFORM):
+                self.others.append(search.node(belief))
+        waiting = [node for _, node in search.roots] + self.others
+        while True:
+            self.demand.poll()
+            gap, node = corners.worst()
+            at_corner = node is not None
+            for other in waiting:
+                if other.gap > gap:
+                    gap, node, at_corner = other.gap, other, False
+            if gap <= self.demand.gap or node is None:
+                return "converged" if self.everywhere_gap() <= self.demand.gap else "rounding limit"
+            if self.demand.iterations is not None and self.trials >= self.demand.iterations:
+                return "iteration limit"
+            before = node.lower, node.upper, len(search.nodes), search.backups
+            search.trial(max(self.demand.gap / 2, node.gap * SHARE), node)
+            self.trials += 1
+            self.note_bounds()
+            if at_corner:
+                corners.learn(node)
+            if (node.lower, node.upper, len(search.nodes), search.backups) == before:
+                if at_corner:
+                    corners.give_up(node)
+                else:
+                    waiting.remove(node)
+
+    def everywhere_gap(self) -> float:
+        """The largest gap at the corners, the uniform belief and the start, of the policy so far."""
+        if self.corners is None or self.search is None:
+            return self.first.ceiling - self.first.floor
+        gaps = [node.gap for node in self.others] + [self.bounds[1] - self.bounds[0]]
+        return max(self.corners.gap(self.policy()), *gaps)
 
     def improve(self) -> Status:
         """Trials until the gap, or the limit of iterations, is reached."""
@@ -266,10 +323,12 @@ def solve_symbolic(
     *,
     node_limit: int = NODE_LIMIT,
     belief_limit: int = BELIEF_LIMIT,
+    everywhere: bool = False,
 ) -> SymbolicSolution:
     """Bounds on the optimal value of a partially observed model, and a policy, without listing its states.
 
-    `demand.iterations` counts trials.
+    `demand.iterations` counts trials.  `everywhere` asks for the gap at all corners and at the uniform
+    belief as well, and not only at the initial one.
 
     Raises:
         ModelError: a fully observed model, a finite horizon, or a discount of 1.
@@ -282,7 +341,7 @@ def solve_symbolic(
     with interrupts_at_polls(), _deadline(symbolic, demand.deadline):
         try:
             run.first_bounds()
-            status = run.improve()
+            status = run.improve_everywhere() if everywhere else run.improve()
         except (TimeIsUp, Aborted):
             status = "time limit"
         except KeyboardInterrupt:
@@ -291,7 +350,7 @@ def solve_symbolic(
             status = "memory limit"
             run.notes.append(_limit_text(error, belief_limit))
     with symbolic.manager.undisturbed():
-        return _finished(run, status)
+        return _finished(run, status, everywhere)
 
 
 def _limit_text(error: Exception, belief_limit: int) -> str:
@@ -300,7 +359,7 @@ def _limit_text(error: Exception, belief_limit: int) -> str:
     return str(error)
 
 
-def _finished(run: _Run, status: Status) -> SymbolicSolution:
+def _finished(run: _Run, status: Status, everywhere: bool) -> SymbolicSolution:
     if run.search is not None:
         lower, upper = run.search.bounds()
         run.bounds = (max(run.bounds[0], lower), min(run.bounds[1], upper))
@@ -327,4 +386,5 @@ def _finished(run: _Run, status: Status) -> SymbolicSolution:
         0 if search is None else len(search.nodes), 0 if search is None else len(search.lower.sets),
         0 if search is None else search.backups, space.projections, run.trials,
         time.monotonic() - run.began, tuple(run.history), "; ".join(notes),
+        run.everywhere_gap() if everywhere else None,
     )  # fmt: skip

@@ -18,6 +18,7 @@ from factored_polca.diagrams import Diagram, node_count
 from factored_polca.diagrams.jit import kernel
 from factored_polca.structured.alpha_forest import Forest, pair_ratio
 from factored_polca.structured.pomdp_belief import BeliefSpace
+from factored_polca.structured.pomdp_informed import InformedBound
 from factored_polca.structured.pomdp_model import Seen
 from factored_polca.structured.pomdp_point import PointBelief
 from factored_polca.structured.rounding import round_to_size
@@ -29,6 +30,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 BASE_NODES = 2_000
 """Nodes of a base bound at one y."""
+
+INFORMED_NODES = 5_000
+"""The same of one that was found on tables, which has as many values as cells."""
 
 SHRUNK = 1 - 1e-12
 """What a computed ratio is multiplied by, to be below the exact one."""
@@ -172,20 +176,37 @@ class PointSet:
 
 
 class UpperBound:
-    """The points at every y; `quality` [action] are diagrams over the whole state."""
+    """The points at every y; `quality` [action] are diagrams over the whole state.
 
-    def __init__(self, space: BeliefSpace, quality: list[Diagram], size: float) -> None:
+    Where an `informed` bound was computed, its Q_a take their place.
+    """
+
+    def __init__(
+        self,
+        space: BeliefSpace,
+        quality: list[Diagram],
+        size: float,
+        informed: InformedBound | None = None,
+        width: float = 0.0,
+    ) -> None:
         self.space, self.quality, self.size = space, quality, size
+        self.informed, self.width = informed, width
         self.sets: dict[Seen, PointSet] = {}
 
     def at(self, seen: Seen) -> PointSet:
         """The points at one y."""
         if seen not in self.sets:
             forest = Forest(self.space.pomdp.manager)
-            slices = [self.space.pomdp.at(seen, diagram) for diagram in self.quality]
-            forest.add_all([self._small(diagram) for diagram in slices])
+            forest.add_all(self.base(seen))
             self.sets[seen] = PointSet(self.space, forest)
         return self.sets[seen]
+
+    def base(self, seen: Seen) -> list[Diagram]:
+        """Q_a [action] at one y."""
+        if self.informed is not None and seen in self.informed.q:
+            return self.informed.diagrams(seen, INFORMED_NODES, self.width)
+        slices = [self.space.pomdp.at(seen, diagram) for diagram in self.quality]
+        return [self._small(diagram) for diagram in slices]
 
     def _small(self, diagram: Diagram) -> Diagram:
         """A base bound at one y with leaves merged upwards where it has too many nodes."""

@@ -16,8 +16,8 @@ from typing import Any, Literal, TypeAlias
 
 from factored_polca.drawn import Framed
 from factored_polca.hierarchy import HierarchicalPlan, Options, plan_mdp, plan_pomdp
-from factored_polca.hierarchy.parameters import pomdp_parameters, unreduced_parameters
-from factored_polca.hierarchy.pomdp_report import polca_parameters
+from factored_polca.hierarchy.parameters import unreduced_parameters
+from factored_polca.hierarchy.pomdp_report import polca_parameters, task_parameters
 from factored_polca.models import LimitReached, Model, ModelError, TaskHierarchy
 
 Progress: TypeAlias = Callable[[str], None]
@@ -38,7 +38,7 @@ class TaskParameters:
     name: str
     none: int | None
     polca: int | None
-    polca_plus: int
+    polca_plus: int | None
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def study_parameters(
     except (ModelError, LimitReached) as error:
         notes.append(f"PolCA is left out: {error}")
     progress("counting without abstraction")
-    none = unreduced_parameters(plan.symbolic, [solved.reduction.process for solved in plan.solved])
+    none = unreduced_parameters(plan.symbolic, [solved.process for solved in plan.solved])
     if none is None:
         notes.append("without abstraction: too many states to list")
     counted = tuple(
@@ -109,7 +109,7 @@ def study_parameters(
             solved.task.name,
             None if none is None else none[number],
             None if polca is None else polca_parameters(polca, solved.task.name),
-            pomdp_parameters(solved.reduction.pomdp_quotient.pomdp),
+            task_parameters(solved),
         )
         for number, solved in enumerate(plan.solved)
     )

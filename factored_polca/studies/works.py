@@ -154,6 +154,7 @@ def plan(subject: Subject, request: Mapping[str, Any], tell: Tell) -> dict[str, 
     from factored_polca.hierarchy import plan as plan_model
     from factored_polca.hierarchy.options import FLAT_BLOCK_LIMIT, TRIALS
     from factored_polca.hierarchy.solved import StructuredTask
+    from factored_polca.hierarchy.symbolic_task import SymbolicPomdpTask
 
     given = request["options"]
     options = Options(
@@ -174,7 +175,9 @@ def plan(subject: Subject, request: Mapping[str, Any], tell: Tell) -> dict[str, 
     tell("compiling diagrams")
     found = plan_model(subject.model, subject.tasks, options, progress=progress)
     blocks = [
-        None if isinstance(solved, StructuredTask) else solved.reduction.partition.blocks
+        None
+        if isinstance(solved, (StructuredTask, SymbolicPomdpTask))
+        else solved.reduction.partition.blocks
         for solved in found.solved
     ]
     figures: dict[str, Any] = {

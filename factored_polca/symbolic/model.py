@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-import networkx as nx
 import numpy as np
 
 from factored_polca.diagrams import (
@@ -46,7 +45,16 @@ from factored_polca.symbolic.observations import (
     restrict_to_possible,
 )
 from factored_polca.symbolic.order import variable_order
-from factored_polca.symbolic.rows import Row, RowDiagram, Term, as_number, mean, numbered, possible
+from factored_polca.symbolic.rows import (
+    Row,
+    RowDiagram,
+    Term,
+    as_number,
+    elimination_order,
+    mean,
+    numbered,
+    possible,
+)
 
 
 @dataclass(frozen=True)
@@ -300,7 +308,7 @@ class _Build:
             )
         self.settle_suspects(rows)
         observations = compile_observations(self, action, app, rows)
-        elimination = self.elimination(rows)
+        elimination = elimination_order(self.positions, rows)
         terms: list[tuple[Expression, tuple[str, ...]]]
         terms = [(term, ("reward", str(i))) for i, term in enumerate(self.model.rewards)]
         terms += [(term, (*path, "reward", str(i))) for i, term in enumerate(action.rewards)]
@@ -387,15 +395,6 @@ class _Build:
             hint = "make the row sum to exactly 1; 0.333 is not 1/3"
         name = f"{variable.name}'" if isinstance(variable, Feature) else variable.name
         self.faults.append(Fault(f"the distribution of {name}{where}: {row.reason}", path, hint))
-
-    def elimination(self, rows: dict[int, RowDiagram]) -> tuple[int, ...]:
-        """All features, those nobody's next value depends on first."""
-        graph = nx.DiGraph()
-        graph.add_nodes_from(range(len(self.model.features)))
-        for row in rows.values():
-            graph.add_edges_from((row.feature, parent) for parent in row.parents_next)
-        key = self.positions.__getitem__
-        return tuple(nx.lexicographical_topological_sort(graph, key=lambda i: -key(i)))
 
     def sampled_term(
         self,

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
 from factored_polca.diagrams import (
@@ -35,7 +36,7 @@ from factored_polca.diagrams import (
 )
 from factored_polca.symbolic.boolean_sets import BooleanSets
 from factored_polca.symbolic.model import SymbolicAction, SymbolicModel
-from factored_polca.symbolic.rows import possible
+from factored_polca.symbolic.rows import RowDiagram, possible
 
 Backend: TypeAlias = Literal["dd", "kernel"]
 
@@ -261,3 +262,10 @@ class _LibrarySets:
 
     def is_empty(self, a: Any) -> bool:
         return bool(a == self.sets.bdd.false)
+
+
+def uniform_rows(symbolic: SymbolicModel) -> dict[int, RowDiagram]:
+    """The uniform distribution over all states, as the rows of an initial belief."""
+    zero = symbolic.manager.constant(0)
+    shares = [Fraction(1, len(feature.values)) for feature in symbolic.model.features]
+    return {i: RowDiagram(i, zero, ((q,) * int(1 / q),)) for i, q in enumerate(shares)}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import networkx as nx
 import numpy as np
 
 from factored_polca.diagrams import INDEX, Diagram, choose, cofactors, combine, leaves, relabel
@@ -35,6 +36,19 @@ class Term:
 
     diagram: Diagram
     values: tuple[Fraction, ...]
+
+
+def elimination_order(positions: Sequence[int], rows: Mapping[int, RowDiagram]) -> tuple[int, ...]:
+    """All features, those nobody's next value depends on first; `positions` [feature] break ties.
+
+    Raises:
+        networkx.NetworkXUnfeasible: next values depend on each other in a circle.
+    """
+    graph = nx.DiGraph()
+    graph.add_nodes_from(range(len(positions)))
+    for row in rows.values():
+        graph.add_edges_from((row.feature, parent) for parent in row.parents_next)
+    return tuple(nx.lexicographical_topological_sort(graph, key=lambda i: -positions[i]))
 
 
 def as_number(value: object) -> Fraction:
