@@ -14,6 +14,7 @@ import pytest
 
 from factored_polca.cli import commands, main
 from factored_polca.cli.argument_types import size
+from factored_polca.cli.ctrl_c import ctrl_c_comes_again
 from factored_polca.diagrams import MemoryLimit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -245,8 +246,8 @@ def test_sizes_are_read(text: str, count: int) -> None:
 
 @pytest.mark.parametrize("arguments", [["minimise"], ["plan", "-o", "made.polca"]])
 def test_ctrl_c_ends_a_long_minimisation_with_130(folder: Path, arguments: list[str]) -> None:
-    """2^16 states that all differ take minutes; the signal comes in their midst."""
-    command = [sys.executable, "-m", "factored_polca", *arguments, "expon", "--set", "size=16"]
+    """Numbers of 22 bits that are all different take some ten seconds; the signal comes in their midst."""
+    command = [sys.executable, "-m", "factored_polca", *arguments, "expon", "--set", "size=22"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     before = sorted(folder.iterdir())
     with subprocess.Popen(
@@ -263,6 +264,43 @@ def test_ctrl_c_ends_a_long_minimisation_with_130(folder: Path, arguments: list[
     assert out == ""
     assert err.strip() == "interrupted"
     assert sorted(folder.iterdir()) == before
+
+
+class Swallows:
+    """What is raised while it goes away, C code swallows."""
+
+    def __del__(self) -> None:
+        raise KeyboardInterrupt
+
+
+def swallow_and_work_on() -> None:
+    with ctrl_c_comes_again():
+        Swallows()
+        time.sleep(10)
+
+
+def swallow_and_fail() -> None:
+    with ctrl_c_comes_again():
+        Swallows()
+        raise RuntimeError("no compiled object yet")
+
+
+def test_ctrl_c_that_c_code_swallows_comes_again(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        swallow_and_work_on()
+    assert capsys.readouterr().err == ""
+
+
+def test_an_error_after_ctrl_c_was_swallowed_is_its_consequence(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(KeyboardInterrupt) as caught:
+        swallow_and_fail()
+    assert isinstance(caught.value.__cause__, RuntimeError)
+    time.sleep(0.1)  # it does not come a second time
+    with pytest.raises(RuntimeError), ctrl_c_comes_again():
+        raise RuntimeError("another fault")
+    assert capsys.readouterr().err == ""
 
 
 def test_ctrl_c_while_the_program_starts_ends_with_130() -> None:

@@ -110,6 +110,7 @@ def guarded(parsed: argparse.Namespace) -> int:
     What no one can mend but us is said too, with the status 1; with the variable
     FACTORED_POLCA_TRACEBACK set it comes with the traceback that a report of the fault needs.
     """
+    from factored_polca.cli.ctrl_c import ctrl_c_comes_again
     from factored_polca.cli.memory import memory_backstop, memory_text
     from factored_polca.cli.output import Output
     from factored_polca.cli.source import UsageError
@@ -119,7 +120,7 @@ def guarded(parsed: argparse.Namespace) -> int:
     memory: int | None = getattr(parsed, "memory", None)
     try:
         work = commands()[parsed.command]
-        with memory_backstop(memory):
+        with memory_backstop(memory), ctrl_c_comes_again():
             status = work(parsed, output)
         if parsed.command in MEMORY_NOTED and not parsed.json:
             output.note(f"peak memory {memory_text(output.peak_memory_bytes())}")

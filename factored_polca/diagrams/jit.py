@@ -23,7 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _njit: Any = numba.njit  # its types know no `_nrt`
 
 KERNELS: list[Any] = []
-"""Every compiled function of the package, in order of definition."""
+"""Every compiled function that planning needs, in order of definition."""
 
 
 def kernel(function: Function) -> Function:
@@ -45,6 +45,18 @@ def lean_kernel(function: Function) -> Function:
     compiled = _njit(cache=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)(function)
     KERNELS.append(compiled)
     return cast(Function, compiled)
+
+
+def late_kernel(function: Function) -> Function:
+    """A kernel that few models need: it is compiled when it is called first, not ahead."""
+    return cast(Function, _njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function))
+
+
+def late_lean_kernel(function: Function) -> Function:
+    """A lean kernel that few models need."""
+    return cast(
+        Function, _njit(cache=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)(function)
+    )
 
 
 def inner_kernel(function: Function) -> Function:

@@ -11,7 +11,7 @@ ends.
 
 from __future__ import annotations
 
-from factored_polca.diagrams.jit import inline, int64, lean_kernel
+from factored_polca.diagrams.jit import inline, int64, late_lean_kernel
 from factored_polca.diagrams.nodes import Int32Array, Int64Array, payload
 
 
@@ -24,7 +24,7 @@ def leaf_at(pool: Int32Array, leaf_level: int, columns: Int32Array, root: int, r
     return node
 
 
-@lean_kernel
+@late_lean_kernel
 def next_outcome(
     pool: Int32Array, leaf_level: int, columns: Int32Array, roots: Int32Array, targets: Int32Array,
     bases: Int64Array, start: Int64Array, value: Int32Array, first: int, last: int, begin: int,

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams.field import field_add, field_multiply, field_subtract
-from factored_polca.diagrams.jit import int64, lean_kernel
+from factored_polca.diagrams.jit import int64, late_lean_kernel
 from factored_polca.diagrams.nodes import DONE, STEPS, YIELDED, Int32Array, Int64Array, payload
 from factored_polca.minimisation.draws_kernel import leaf_at, next_outcome
 
@@ -45,7 +45,7 @@ _ZERO = np.uint64(0)
 _SHORT_PIECE = 12
 
 
-@lean_kernel
+@late_lean_kernel
 def list_weights(
     pool: Int32Array, leaf_level: int, columns: Int32Array, field: UInt64Array,
     apps: Int32Array, policies: Int32Array, primitives: Int64Array, local: Int64Array,
@@ -117,7 +117,7 @@ def list_weights(
     return DONE
 
 
-@lean_kernel
+@late_lean_kernel
 def transpose(
     first: Int64Array, target: Int32Array, weight: UInt64Array, column_first: Int64Array,
     source: Int32Array, column_weight: UInt64Array,
@@ -136,7 +136,7 @@ def transpose(
             column_first[target[e] + 1] = at + 1
 
 
-@lean_kernel
+@late_lean_kernel
 def sort_by(keys: UInt64Array, items: Int32Array, low: int, high: int, stack: Int64Array) -> None:
     """Sort items[low:high] by their keys: quicksort in three parts, since many keys are alike."""
     stack[0] = low
@@ -184,7 +184,7 @@ def sort_by(keys: UInt64Array, items: Int32Array, low: int, high: int, stack: In
             items[j] = item
 
 
-@lean_kernel
+@late_lean_kernel
 def refine_listed(
     column_first: Int64Array, source: Int32Array, weight: UInt64Array, field: UInt64Array,
     order: Int32Array, place: Int32Array, begin: Int32Array, end: Int32Array, block: Int32Array,

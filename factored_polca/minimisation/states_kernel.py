@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from factored_polca.diagrams.jit import inline, int64, lean_kernel
+from factored_polca.diagrams.jit import inline, int64, late_lean_kernel
 from factored_polca.diagrams.nodes import DONE, Int32Array, Int64Array, mix, payload
 from factored_polca.minimisation.draws_kernel import leaf_at, next_outcome
 
@@ -49,7 +49,7 @@ def slot_of(row: Int32Array, offset: int, count: int, table: Int32Table, slots: 
     return i
 
 
-@lean_kernel
+@late_lean_kernel
 def number_state(
     row: Int32Array, offset: int, count: int, table: Int32Table, slots: Int32Array, state: Int64Array
 ) -> int:  # fmt: skip
@@ -66,14 +66,14 @@ def number_state(
     return int64(slots[i]) - 1
 
 
-@lean_kernel
+@late_lean_kernel
 def place_states(table: Int32Table, states: int, slots: Int32Array) -> None:
     """Fill the empty table `slots` with so many states."""
     for number in range(states):
         slots[slot_of(table[number], 0, table.shape[1], table, slots)] = number + 1
 
 
-@lean_kernel
+@late_lean_kernel
 def list_outcomes(
     pool: Int32Array, leaf_level: int, columns: Int32Array, terminal: int, apps: Int32Array, total: int,
     first_draw: Int64Array, roots: Int32Array, targets: Int32Array, bases: Int64Array, start: Int64Array,

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, Diagram, Manager
-from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.diagrams.jit import int64, late_kernel
 from factored_polca.diagrams.manager import require
 from factored_polca.diagrams.operations import Walk
 
@@ -39,7 +39,7 @@ REMEMBERED = 1 << 18
 """Pairs of nodes that the table of a pass over two diagrams holds."""
 
 
-@kernel
+@late_kernel
 def export(
     pool: Int32Array, arity: Int32Array, nodes: Int32Array, base: int, first_child: int,
     levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray,
@@ -63,7 +63,7 @@ def export(
     return count
 
 
-@kernel
+@late_kernel
 def expectations(
     levels: Int32Array, first: Int32Array, children: Int32Array, value: FloatArray, sizes: Int32Array,
     offset: IntArray, marginals: FloatArray, start: int, out: FloatArray,
@@ -86,7 +86,7 @@ def expectations(
         out[i] = total
 
 
-@kernel
+@late_kernel
 def pair_expectations(
     roots: IntArray, top: int, levels: Int32Array, first: Int32Array, children: Int32Array,
     value: FloatArray, b_levels: Int32Array, b_first: Int32Array, b_children: Int32Array,
@@ -164,7 +164,7 @@ def pair_expectations(
         out[i] = result * ways[min(levels[roots[i]], b_levels[top])]
 
 
-@kernel
+@late_kernel
 def pair_ratio(
     a_root: int, b_root: int, order: IntArray, in_a: IntArray, in_b: IntArray,
     a_levels: Int32Array, a_first: Int32Array, a_children: Int32Array, a_value: FloatArray,

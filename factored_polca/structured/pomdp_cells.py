@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import FLOAT, Diagram, Manager, load, node_count, support
-from factored_polca.diagrams.jit import int64, kernel
+from factored_polca.diagrams.jit import int64, late_kernel
 from factored_polca.structured.pomdp_model import FactoredPOMDP, Seen, Step
 from factored_polca.structured.rounding import Direction, group
 
@@ -86,7 +86,7 @@ class Table:
         return Table((*self.axes[:place], *self.axes[place + 1 :]), values)
 
 
-@kernel
+@late_kernel
 def spread(
     pool: Int32Array, root: int, axes: IntArray, sizes: IntArray, out: npt.NDArray[np.uint64]
 ) -> None:

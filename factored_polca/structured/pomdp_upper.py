@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factored_polca.diagrams import Diagram, node_count
-from factored_polca.diagrams.jit import kernel
+from factored_polca.diagrams.jit import late_kernel
 from factored_polca.structured.alpha_forest import Forest, pair_ratio
 from factored_polca.structured.pomdp_belief import BeliefSpace
 from factored_polca.structured.pomdp_informed import InformedBound
@@ -41,7 +41,7 @@ LOOKED_BACK = 2_000
 """Changes of points that a belief catches up with, the latest ones."""
 
 
-@kernel
+@late_kernel
 def sawtooth(
     marginals: FloatArray, quality: FloatArray, points: FloatArray, values: FloatArray, base: FloatArray,
     groups: IntArray, chosen: IntArray, product: BoolArray, shrunk: float,
@@ -73,7 +73,7 @@ def sawtooth(
     return best
 
 
-@kernel
+@late_kernel
 def joint_sawtooth(
     marginals: FloatArray, quality: FloatArray, points: FloatArray, values: FloatArray, base: FloatArray,
     chosen: IntArray, all_of_them: bool, product: BoolArray, shrunk: float,
