@@ -14,7 +14,7 @@ from factored_polca.bench.cases import CASES, Case, chosen
 from factored_polca.bench.dyadic import dyadic
 from factored_polca.bench.runner import PeerRow, Row, run_case
 from factored_polca.bench.storm import storm
-from factored_polca.bench.table import cells, growths, markdown
+from factored_polca.bench.table import cells, growths, markdown, ratio_text
 from factored_polca.cli import main
 from factored_polca.explicit.enumeration import enumerate_model
 
@@ -96,6 +96,7 @@ def test_a_row_shows_the_quicker_peer_and_the_ratio() -> None:
     slow, quick = PeerRow("Storm dd", 9, 4.0, 1 << 30), PeerRow("Storm sparse", 9, 1.0, 1 << 20)
     shown = cells(row(CASES[0], 0.05, peers=(slow, quick)))
     assert shown[8:] == ("Storm sparse", "9", "1.00", "1", "20")
+    assert [ratio_text(ratio) for ratio in (0.766, 9.94, 99.6, 1234.0)] == ["0.77", "9.9", "100", "1,234"]
     failed = PeerRow("Storm dd", None, None, None, "more than 9 s")
     assert cells(row(CASES[0], 0.05, peers=(failed,)))[8] == "Storm dd: more than 9 s"
 

@@ -38,6 +38,11 @@ def seconds_text(seconds: float) -> str:
     return f"{seconds:.3f}" if seconds < 0.1 else f"{seconds:.2f}" if seconds < 10 else f"{seconds:.1f}"
 
 
+def ratio_text(ratio: float) -> str:
+    """A ratio with two digits, or as a whole number."""
+    return f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"
+
+
 def mebibytes(size: int) -> str:
     """Bytes as MiB."""
     return f"{size / 2**20:,.0f}"
@@ -54,7 +59,7 @@ def cells(row: Row) -> tuple[str, ...]:
         )  # fmt: skip
     best = row.best_peer
     if best is not None and best.seconds is not None:
-        ratio = "" if row.ratio is None else f"{row.ratio:.2g}"
+        ratio = "" if row.ratio is None else ratio_text(row.ratio)
         return (
             *ours, best.program, f"{best.blocks:,}", seconds_text(best.seconds),
             mebibytes(best.memory or 0), ratio,
