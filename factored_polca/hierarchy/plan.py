@@ -45,8 +45,8 @@ from factored_polca.hierarchy.solved import AnySolvedTask, SolvedTask, Structure
 from factored_polca.hierarchy.structured_task import (
     ASKED_FOR,
     STRUCTURED,
-    can_fall_back,
     on_diagrams,
+    reduction_or_reason,
     solve_on_diagrams,
 )
 from factored_polca.hierarchy.subtask import refuse_without_purpose, subtask_process
@@ -346,19 +346,10 @@ class _Planner:
             return ASKED_FOR
         options = self.options
         falls_back = method == "auto" and custom is None and self.symbolic.model.discount != 1
-        limit = options.block_limit
-        if falls_back and options.structured_blocks is not None:
-            limit = min(options.structured_blocks, limit or options.structured_blocks)
-        try:
-            return self.reduce(name, process, limit)
-        except LimitReached as error:
-            if not falls_back or not can_fall_back(error, limit == options.block_limit):
-                raise
-            return f"no quotient ({error})"
-        except MemoryLimit as error:
-            if not falls_back:
-                raise
-            return f"no quotient ({error})"
+        return reduction_or_reason(
+            lambda limit: self.reduce(name, process, limit),
+            falls_back, options.block_limit, options.structured_blocks,
+        )  # fmt: skip
 
     def on_diagrams(self, task: Task, process: DecisionProcess, reason: str) -> StructuredTask:
         """Steps 3 and 4 of PolCA without a quotient."""

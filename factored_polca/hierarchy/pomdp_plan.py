@@ -47,7 +47,7 @@ from factored_polca.hierarchy.pomdp_solved import (
     corner_choices,
     root_beliefs,
 )
-from factored_polca.hierarchy.structured_task import ASKED_FOR, can_fall_back
+from factored_polca.hierarchy.structured_task import ASKED_FOR, reduction_or_reason
 from factored_polca.hierarchy.subtask import planning_channels, refuse_without_purpose, subtask_process
 from factored_polca.hierarchy.symbolic_task import (
     SYMBOLIC,
@@ -254,20 +254,10 @@ class _Planner:
             return ASKED_FOR
         options = self.options
         falls_back = method == "auto" and (self.custom is None or task.solver is not None)
-        limit = options.block_limit
-        if falls_back and options.symbolic_blocks is not None:
-            limit = min(options.symbolic_blocks, limit or options.symbolic_blocks)
-        try:
-            return self.reduce(task.name, process, limit)
-        except LimitReached as error:
-            strict = limit == options.block_limit
-            if not falls_back or "joint observations" in str(error) or not can_fall_back(error, strict):
-                raise
-            return f"no quotient ({error})"
-        except MemoryLimit as error:
-            if not falls_back:
-                raise
-            return f"no quotient ({error})"
+        return reduction_or_reason(
+            lambda limit: self.reduce(task.name, process, limit),
+            falls_back, options.block_limit, options.symbolic_blocks,
+        )  # fmt: skip
 
     def on_diagrams(self, task: Task, process: DecisionProcess, reason: str) -> AnySolvedPomdpTask:
         """Steps 2 to 4 without a quotient."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from factored_polca.diagrams import (
     FLOAT,
     INDEX,
+    MemoryLimit,
     choose,
     leaves,
     pairs,
@@ -27,7 +29,7 @@ from factored_polca.diagrams.operations import leaf_payloads
 from factored_polca.hierarchy.options import Options
 from factored_polca.hierarchy.solved import StructuredTask
 from factored_polca.hierarchy.subtask import nothing_to_optimise
-from factored_polca.minimisation import DecisionProcess, Partition
+from factored_polca.minimisation import DecisionProcess, Partition, Reduction
 from factored_polca.models import LimitReached, Task
 from factored_polca.structured.bellman import leaf_values
 from factored_polca.structured.dead_ends import PossibleView
@@ -49,12 +51,40 @@ KEPT_VALUES: Final = 1000
 """Values of a task that execution keeps apart."""
 
 
-def can_fall_back(error: LimitReached, strict: bool) -> bool:
+def reduction_or_reason(
+    reduce: Callable[[int | None], Reduction],
+    falls_back: bool,
+    limit: int | None,
+    diagrams_beyond: int | None,
+) -> Reduction | str:
+    """What `reduce` makes within a limit of blocks, or why a task that `falls_back` is solved on diagrams.
+
+    Beyond `diagrams_beyond` blocks it falls back; `limit` is the user's own, an error beyond it.
+
+    Raises:
+        LimitReached, MemoryLimit: what stopped the reduction is no reason to fall back.
+    """
+    within = limit
+    if falls_back and diagrams_beyond is not None:
+        within = min(diagrams_beyond, limit or diagrams_beyond)
+    try:
+        return reduce(within)
+    except LimitReached as error:
+        if not falls_back or not _can_fall_back(error, strict=within == limit):
+            raise
+        return f"no quotient ({error})"
+    except MemoryLimit as error:
+        if not falls_back:
+            raise
+        return f"no quotient ({error})"
+
+
+def _can_fall_back(error: LimitReached, *, strict: bool) -> bool:
     """Whether what stopped a reduction was memory, or a limit of blocks that is not `strict`."""
     text = str(error)
     if error.stage not in ("minimisation", "quotient") or "time limit" in text or "aborted" in text:
         return False
-    return not (strict and text.startswith("more than"))
+    return "joint observations" not in text and not (strict and text.startswith("more than"))
 
 
 def on_diagrams(
